@@ -108,7 +108,7 @@ fn interrupt(learn: Running, mut said: BufReader<ChildStderr>) -> (std::process:
 }
 
 #[test]
-fn all_that_it_saw_goes_on_under_the_rules_that_it_writes_and_nothing_else() {
+fn learned_rules_permit_the_seen_uses_and_no_other() {
     let hosts = Hosts::start();
     let (here, there) = (hosts.robot.session("robot"), hosts.base.session("base"));
     let commands = (publisher(&there, "/cmd_vel"), subscription(&here, "/cmd_vel"));

@@ -286,7 +286,7 @@ fn echo_under_nohup_outlives_its_terminal() {
 }
 
 #[test]
-fn a_daemon_killed_in_the_middle_of_a_replay_loses_nothing_and_has_a_successor() {
+fn replay_survives_a_killed_daemon_without_loss() {
     let host = Host::new();
     let echoes = Echoes::start(&host);
     let play = Running::start(host.axon(&["play", LOG, "--rate", "60", "--wait", "1"]));
@@ -300,7 +300,7 @@ fn a_daemon_killed_in_the_middle_of_a_replay_loses_nothing_and_has_a_successor()
 }
 
 #[test]
-fn the_daemon_in_the_foreground_is_the_one_that_status_shows_and_ends_on_sigterm() {
+fn status_shows_the_foreground_daemon_which_ends_on_sigterm() {
     let host = Host::new();
     let daemon = Running::start(host.axon(&["daemon"]));
     eventually("the daemon", || host.status().is_some());

@@ -92,7 +92,7 @@ fn a_name_that_no_trust_file_can_hold_leaves_no_key_behind() {
 }
 
 #[test]
-fn a_key_is_its_owners_alone_and_its_line_is_that_of_a_trust_file() {
+fn key_file_is_private_and_the_printed_line_fits_a_trust_file() {
     let dir = tempfile::tempdir().expect("directory");
     for (algorithm, args) in
         [("default", &[][..]), ("ed25519", &["--algorithm", "ed25519", "--name", "arm-2"])]

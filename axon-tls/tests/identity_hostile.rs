@@ -107,7 +107,7 @@ fn mutations(whole: &[u8]) -> Vec<Vec<u8>> {
 }
 
 #[test]
-fn a_raw_key_that_is_not_the_signers_is_refused_even_where_any_key_is_accepted() {
+fn raw_key_of_another_signer_is_refused_even_if_any_key_is_accepted() {
     let anybody = Auth::None(SigningKey::generate().unwrap());
     let pem = SigningKey::generate_pem_with(KeyAlgorithm::Ed25519).unwrap();
     let key = signs(&pem);

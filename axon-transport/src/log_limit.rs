@@ -36,7 +36,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn it_is_said_at_once_and_then_once_a_second_with_how_many_there_were() {
+    fn repeated_log_lines_are_counted_once_a_second() {
         let limit = LogLimit::default();
         let at = |milliseconds| limit.count(Duration::from_millis(milliseconds));
         assert_eq!([0, 1, 500, 999].map(at), [Some(1), None, None, None]);

@@ -18,7 +18,7 @@ pub use self::{
     link::{CompressedStatus, LinkStatus, WaitingStatus},
 };
 
-/// The whole status.
+/// The whole status of a daemon.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct Status {
@@ -26,7 +26,7 @@ pub struct Status {
     pub daemon: String,
     /// The id of the daemon's process.
     pub pid: u32,
-    /// The time since its start; whole seconds in JSON.
+    /// The time since the daemon's start; whole seconds in JSON.
     #[serde(rename = "uptime_s", with = "times::seconds")]
     pub uptime: Duration,
     /// The session protocol's version.
@@ -51,13 +51,13 @@ pub struct Status {
     pub key_mode: Option<String>,
     /// `psk_ke` or `psk_dhe_ke` in qkd.
     pub kex: Option<String>,
-    /// The one cipher.
+    /// The only cipher that is offered.
     pub cipher: String,
     /// This host's SAE ID in qkd.
     pub sae: Option<String>,
     /// The address at which sessions find the daemon.
     pub socket: String,
-    /// The directory of its files; if absent, nothing is kept.
+    /// The directory of the daemon's files. If absent, the daemon keeps no files.
     pub runtime_dir: Option<String>,
     /// The gateway's UDP port; absent while the gateway is not running.
     pub port: Option<u16>,
@@ -124,33 +124,33 @@ pub struct DescriptorStatus {
 pub struct SessionStatus {
     /// The id of the session's process.
     pub pid: u32,
-    /// Its name.
+    /// The session's name.
     pub name: String,
     /// `application` or `gateway`.
     pub role: String,
-    /// Its user, if that is not the daemon's.
+    /// The session's user, if that is not the daemon's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub user: Option<u32>,
-    /// The common beginning of its endpoints' GIDs, in hexadecimal.
+    /// The common beginning of the GIDs of the session's endpoints, in hexadecimal.
     #[serde(default)]
     pub gids: String,
-    /// Number of its endpoints.
+    /// Number of the session's endpoints.
     pub endpoints: usize,
-    /// Number of control packets that wait for it.
+    /// Number of control packets that wait for the session.
     pub queued: usize,
-    /// Its discovery range: `SUBNET`, `LOCALHOST` or `OFF`; absent for the gateway.
+    /// The session's discovery range: `SUBNET`, `LOCALHOST` or `OFF`; absent for the gateway.
     #[serde(default)]
     pub range: Option<String>,
-    /// True if it stated that range; a session that did not is limited to `LOCALHOST`.
+    /// True if the session stated that range. A session that did not is limited to `LOCALHOST`.
     #[serde(default)]
     pub range_stated: bool,
-    /// Its static peers.
+    /// The session's static peers.
     #[serde(default)]
     pub static_peers: Vec<String>,
-    /// The daemon ids of the linked peers among its static peers.
+    /// The daemon ids of the linked peers among the session's static peers.
     #[serde(default)]
     pub lists: Vec<String>,
-    /// Present if it shares no memory: its samples pass through the daemon.
+    /// Present if the session shares no memory. The daemon then relays its samples.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub relay: Option<RelayStatus>,
 }
@@ -163,14 +163,15 @@ pub struct RelayStatus {
     pub reason: String,
     /// Number of samples from the session.
     pub samples_in: u64,
-    /// Their bytes.
+    /// Number of bytes of these samples from the session.
     pub bytes_in: u64,
     /// Number of samples to the session.
     pub samples_out: u64,
-    /// Their bytes.
+    /// Number of bytes of these samples to the session.
     pub bytes_out: u64,
-    /// Number of samples of its publishers that were overwritten before they had crossed, or for which there was no
-    /// memory, and of samples that writers outside the session left when they ended and that it did not take.
+    /// Number of lost samples. A sample of the session's publishers is lost if it is overwritten before it crosses,
+    /// or if there is no memory for it. A sample of a writer outside the session is lost if the writer ended and the
+    /// session did not take it.
     pub lost: u64,
 }
 
@@ -178,48 +179,57 @@ pub struct RelayStatus {
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct TopicStatus {
-    /// Its name.
+    /// The topic's name.
     pub topic: String,
-    /// Its type.
+    /// The topic's type.
     pub type_name: String,
-    /// Publishers on this host.
+    /// Number of publishers on this host.
     pub publishers: usize,
-    /// Subscriptions on this host.
+    /// Number of subscriptions on this host.
     pub subscriptions: usize,
-    /// Publishers on other hosts.
+    /// Number of publishers on other hosts.
     pub remote_publishers: usize,
-    /// Subscriptions on other hosts.
+    /// Number of subscriptions on other hosts.
     pub remote_subscriptions: usize,
-    /// Samples that publishers of this host wrote.
+    /// Number of samples that publishers of this host wrote.
     pub published: u64,
-    /// Samples that came from other hosts.
+    /// Number of samples that arrived from other hosts.
     pub arrived: u64,
-    /// Bytes of memory that its publishers on this host, stand-ins for remote ones among them, have
-    /// committed.
+    /// Bytes of memory that the topic's publishers on this host have committed, including the stand-ins for remote
+    /// publishers.
     pub bytes_committed: u64,
-    /// Samples that were not delivered on this host, by why: `overwritten` before a reader took
-    /// them within its depth; `blocked`, `no_memory`, `pinned` as for [`WriterStatus`]. And samples of
-    /// publishers here that another host did not acknowledge: `link_ended` when its link did (so are
-    /// requests and responses that were not sent), `publisher_ended` ten seconds without progress after
-    /// their publisher did, `stalled` when its readers took nothing. `publisher_ended` also counts what a
-    /// process that shares no memory left when it ended and no reader took for a second, and `ring` what
-    /// the daemon could not write for such a process. On the way to other hosts: `queue`
-    /// while more waited than the history's depth, `late` for what could not arrive in time, `no_key` while there
-    /// was none, `no_link`, `no_route` when the other host did not want them any more. On arrival: `ring`, `no_link`,
-    /// `no_route`, `no_client`, `held` where the other host's samples take as much memory here as they may.
+    /// Number of samples that were not delivered, by reason.
+    ///
+    /// On this host: `overwritten` before a reader took them within its depth; `blocked`, `no_memory` and `pinned` as
+    /// for [`WriterStatus`].
+    ///
+    /// Samples of publishers on this host that another host did not acknowledge: `link_ended` if the link ended, also
+    /// for requests and responses that were not sent; `publisher_ended` if ten seconds passed without progress after
+    /// the publisher ended; `stalled` if the other host's readers took nothing.
+    ///
+    /// Samples of a process that shares no memory: `publisher_ended` also counts samples that the process left when
+    /// it ended and that no reader took for a second; `ring` also counts samples that the daemon could not write for
+    /// the process.
+    ///
+    /// On the way to other hosts: `queue` while more samples waited than the history's depth; `late` if a sample
+    /// could not arrive in time; `no_key` while there was no key; `no_link`; `no_route` if the other host no longer
+    /// wanted the samples.
+    ///
+    /// On arrival: `ring`, `no_link`, `no_route` and `no_client`; `held` while the other host's samples take the
+    /// maximum amount of memory on this host.
     pub dropped: BTreeMap<String, u64>,
-    /// The publishers on this host, stand-ins for remote ones among them: up to 64, those with the
-    /// most memory first.
+    /// The publishers on this host, including the stand-ins for remote publishers: up to 64, those with the most
+    /// memory first.
     pub writers: Vec<WriterStatus>,
-    /// Number of further ones.
+    /// Number of further publishers.
     pub more_writers: usize,
-    /// What each reader on this host took and lost, relays to other hosts among them: up to 64,
+    /// The readers on this host with their taken and lost samples, including the relays to other hosts: up to 64,
     /// those that wait longest and lost most first.
     pub readers: Vec<ReaderStatus>,
-    /// Number of further ones.
+    /// Number of further readers.
     pub more_readers: usize,
-    /// Pairs that are not matched since one session is out of the other's discovery range. Of
-    /// endpoints on other hosts it has those that their daemons showed to this one.
+    /// Pairs that are not matched because one session is outside the other's discovery range. An endpoint on another
+    /// host is included only if its daemon showed it to this one.
     #[serde(default)]
     pub out_of_range: Vec<OutOfRangeStatus>,
     /// Endpoints on this host that match endpoints on another host and exchange no samples with them because a route is
@@ -232,11 +242,11 @@ pub struct TopicStatus {
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct RefusedRouteStatus {
-    /// Its GID.
+    /// The endpoint's GID.
     pub endpoint: String,
-    /// The other host, as it calls itself; empty if this daemon refuses the endpoint.
+    /// The name that the other host states for itself; empty if this daemon refuses the endpoint.
     pub host: String,
-    /// The host that refuses it, and the reason.
+    /// The host that refuses the endpoint, and the reason.
     pub reason: String,
 }
 
@@ -260,15 +270,15 @@ pub struct WriterStatus {
     pub pid: u32,
     /// The publisher's GID.
     pub writer: String,
-    /// True if it is the stand-in for a publisher on another host.
+    /// True if the publisher is the stand-in for a publisher on another host.
     pub stand_in: bool,
-    /// Its history's depth; `null` for KEEP_ALL.
+    /// The depth of the publisher's history; `null` for KEEP_ALL.
     pub depth: Option<u32>,
-    /// Minimum number of samples that it keeps, for its own depth and those of its readers.
+    /// Minimum number of samples that the publisher keeps, for its own depth and those of its readers.
     pub window: u64,
-    /// Bytes of memory that it has committed: descriptors, small samples, segments of large ones.
+    /// Bytes of memory that the publisher has committed: descriptors, small samples, and segments of large samples.
     pub bytes_committed: u64,
-    /// Samples published.
+    /// Number of published samples.
     pub published: u64,
     /// Number of publishes that failed because a KEEP_ALL reader freed no space for as long as they could wait.
     pub blocked: u64,
@@ -289,28 +299,29 @@ pub struct ReaderStatus {
     pub reader: String,
     /// The writer's GID.
     pub writer: String,
-    /// True if it carries samples to other hosts.
+    /// True if the reader carries samples to other hosts.
     pub relay: bool,
-    /// Its history's depth; `null` for KEEP_ALL.
+    /// The depth of the reader's history; `null` for KEEP_ALL.
     pub depth: Option<u32>,
-    /// Number of samples that it can take, at most its depth.
+    /// Number of samples that the reader can take, at most its depth.
     pub unread: u64,
-    /// Samples taken.
+    /// Number of samples taken.
     pub received: u64,
-    /// Samples overwritten before they were taken, within its depth.
+    /// Number of samples overwritten before the reader took them, within its depth.
     pub lost: u64,
-    /// Number of samples skipped because more recent ones filled its depth: no loss.
+    /// Number of samples skipped because more recent ones filled the reader's depth. They are not lost.
     pub skipped: u64,
-    /// The time since the publication of the oldest sample that it has not taken, by the clocks of both hosts if the
-    /// publisher is on another one. Milliseconds in JSON; `null` if it has taken all.
+    /// The time since the publication of the oldest sample that the reader has not taken. If the publisher is on
+    /// another host, the clocks of both hosts determine it. Milliseconds in JSON; `null` if the reader has taken all
+    /// samples.
     #[serde(default, rename = "waiting_ms", with = "times::optional_millis")]
     pub waiting: Option<Duration>,
-    /// True if its process is stopped, by a signal or a debugger.
+    /// True if the reader's process is stopped, by a signal or a debugger.
     pub stopped: bool,
 }
 
 impl ReaderStatus {
-    /// Returns whether it has not taken a sample that has been available for a second.
+    /// Returns whether the reader has not taken a sample that has been available for a second.
     pub fn is_stalled(&self) -> bool {
         self.waiting.is_some_and(|waiting| waiting >= Duration::from_secs(1))
     }
@@ -356,7 +367,7 @@ pub struct ReloadReport {
 pub struct PeerDecisions {
     /// One decision for each use that was asked about, in that order.
     pub decisions: Vec<PeerDecision>,
-    /// The reason why there are none.
+    /// The reason why there are no decisions.
     pub error: Option<String>,
 }
 
@@ -364,7 +375,7 @@ pub struct PeerDecisions {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct PeerDecision {
-    /// True if the peer allows it.
+    /// True if the peer allows the use.
     pub allowed: bool,
     /// The rule that decides, in the peer's words, without control characters.
     pub reason: String,

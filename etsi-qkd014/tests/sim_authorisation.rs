@@ -68,7 +68,7 @@ async fn a_kme_serves_its_own_saes_only() {
 }
 
 #[tokio::test]
-async fn a_key_is_for_the_slaves_it_was_drawn_for_in_the_name_of_their_master() {
+async fn key_is_released_only_to_the_slaves_named_by_its_master() {
     let network = network().await;
     let client = |sae: &str, home: &str| at(&network, network.sae(sae).unwrap(), home);
     let master = client("sae-a", "kme-a");

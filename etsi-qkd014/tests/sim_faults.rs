@@ -107,7 +107,7 @@ async fn files_hold_the_certificates_out_of_their_time() {
 // key_IDs that come again
 
 #[tokio::test]
-async fn a_key_id_of_an_answer_before_is_not_seen_by_the_client_but_by_the_ledger() {
+async fn repeated_key_id_is_found_by_the_ledger() {
     let network = two().start().await.unwrap();
     let kme = network.kme("kme-a").unwrap();
     let (master, slave) = (client(&network, "sae-a"), client(&network, "sae-b"));

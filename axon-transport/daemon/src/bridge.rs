@@ -1,8 +1,8 @@
 //! The messages between the control plane and the gateway.
 //!
-//! They run on threads and runtimes of their own and share nothing but these two bounded channels,
-//! one session socket, and the table of the sessions' keys. Neither waits for the other: the control
-//! plane drops an order that does not fit, and a gateway that fails is started again.
+//! They run on threads and runtimes of their own. They share only these two bounded channels, one session socket, and
+//! the table of the sessions' keys. Neither waits for the other: the control plane drops an order that does not fit,
+//! and a failed gateway is started again.
 
 use std::{
     collections::BTreeSet,
@@ -27,81 +27,82 @@ use crate::{
     owner::SessionKeys,
 };
 
-/// What either channel holds.
+/// Capacity of each channel, in messages.
 pub const CHANNEL: usize = 1024;
 
-/// Stands in the status for topics whose losses are not kept apart: too many, or too long a name.
+/// Name in the status for topics whose losses are not counted separately, because they are too many or the name is too
+/// long.
 pub(crate) const OTHER_TOPICS: &str = "(other topics)";
 
-/// What a gateway is started with.
+/// The parts of a new gateway.
 #[derive(Debug)]
 pub struct GatewayParts {
     /// The daemon's settings.
     pub config: Arc<Config>,
     /// The daemon.
     pub daemon: DaemonId,
-    /// The key of which its id is made.
+    /// The key from which the daemon's id is derived.
     pub daemon_key: Option<Arc<DaemonKey>>,
-    /// The keys of the sessions, with which the gateway proves to peers that they are this daemon's.
+    /// The keys of the sessions. With them the gateway proves to peers that the sessions belong to this daemon.
     pub keys: Arc<SessionKeys>,
-    /// One end of a socket pair, for [`Session::over`](axon_transport::Session::over).
+    /// The gateway's end of a socket pair, for [`Session::over`](axon_transport::Session::over).
     pub socket: OwnedFd,
-    /// To the control plane.
+    /// Sender to the control plane.
     pub control: mpsc::Sender<ToControl>,
-    /// From the control plane.
+    /// Receiver of the control plane's orders.
     pub orders: mpsc::Receiver<ToGateway>,
 }
 
-/// A route that does not cross, though endpoints of this host and the peer's match.
+/// A route that is not served, although endpoints of this host and of the peer match.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RefusedRoute {
-    /// Its topic or service.
+    /// The topic or service.
     pub topic: String,
-    /// Its type; `None`: any.
+    /// The type; `None` for any type.
     pub type_name: Option<String>,
-    /// The endpoints of this host that wait for it.
+    /// The kind of this host's endpoints that wait for the route.
     pub waits: EndpointKind,
-    /// Who refuses it, and why.
+    /// The host that refuses the route, and the reason.
     pub reason: String,
 }
 
-/// What is known of somebody who is refused. Each kind has a rate limit of its own in the log, and a share of the
-/// refusals that status shows, so that a flood of one kind hides no other.
+/// A refused peer. Each kind has its own rate limit in the log and its own share of the refusals in the status, so a
+/// flood of one kind hides no other.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RefusalKind {
-    /// A beacon says so, and anybody can send one.
+    /// Known from a beacon alone; any host can send a beacon.
     Beacon,
-    /// It has not proved who it is, or was dialled at an address that discovery found.
+    /// A peer that did not prove its identity, or was dialled at an address that discovery found.
     Unproven,
-    /// It is at the address of a static peer.
+    /// A peer at the address of a static peer.
     Listed,
-    /// It proved who it is.
+    /// A peer that proved its identity.
     Peer,
-    /// It is a session, or an endpoint, of this host.
+    /// A session or an endpoint of this host.
     Local,
 }
 
-/// The settings on what crosses between hosts that may change while the gateway runs.
+/// The settings for traffic between hosts that may change while the gateway runs.
 #[derive(Clone, Debug)]
 #[non_exhaustive]
 pub struct TrafficRules {
     /// The access rules.
     pub access: AccessRules,
-    /// `[[topic]]` of the file.
+    /// The `[[topic]]` entries of the file.
     pub topics: Vec<TopicRule>,
 }
 
 impl TrafficRules {
-    /// Those of a configuration.
+    /// Returns the rules of a configuration.
     pub fn of(config: &Config) -> Self {
         Self { access: config.access.clone(), topics: config.topics.clone() }
     }
 }
 
-/// From the gateway to the control plane.
+/// A message from the gateway to the control plane.
 #[derive(Debug)]
 pub enum ToControl {
-    /// The gateway stands; its QUIC socket has this port. Sent once, before anything else.
+    /// The gateway runs, and its QUIC socket has this port. Sent once, before any other message.
     Started {
         /// The UDP port.
         port: u16,
@@ -110,131 +111,131 @@ pub enum ToControl {
     RemoteGraph {
         /// The peer.
         daemon: DaemonId,
-        /// Forget what it had.
+        /// True if the peer's earlier endpoints are to be forgotten.
         reset: bool,
-        /// Endpoints that are new.
+        /// New endpoints.
         added: Vec<RemoteEndpoint>,
-        /// Endpoints that are gone.
+        /// Removed endpoints.
         removed: Vec<Gid>,
     },
-    /// A dial, ours or the peer's, became a link.
+    /// A dial by this host or by the peer became a link.
     LinkUp {
         /// The peer.
         daemon: DaemonId,
-        /// Where it is.
+        /// The peer's address.
         address: SocketAddr,
-        /// Whether it proved that the id is its own.
+        /// True if it proved that the id is its own.
         proven: bool,
     },
-    /// How a link does, and routes that do not cross it: at its start and from time to time. Replaces what was known of
-    /// the peer.
+    /// The status of a link, and the routes that do not cross it. Sent at its start and from time to time. It replaces
+    /// the earlier status of the peer.
     Link(Box<LinkStatus>, Vec<RefusedRoute>),
-    /// Whether the path of a link carries anything. While it does not, the peer is looked for at its other addresses. A
-    /// successor's path works until this says otherwise.
+    /// A report about the path of a link. While it carries no packets, discovery looks for the peer at its other
+    /// addresses. A successor's path counts as working until this message reports a failure.
     Path {
         /// The peer.
         daemon: DaemonId,
-        /// Whether it does.
+        /// True if the path carries packets.
         works: bool,
     },
-    /// A peer has been silent for so long that its endpoints are forgotten. Its link stands:
-    /// [`RemoteGraph`](Self::RemoteGraph) brings them back, or the link goes down.
+    /// A peer has been silent for so long that its endpoints are forgotten. Its link stays up: either
+    /// [`RemoteGraph`](Self::RemoteGraph) restores the endpoints, or the link goes down.
     Silent {
         /// The peer.
         daemon: DaemonId,
     },
-    /// A link is over. The peer's endpoints are forgotten.
+    /// A link ended. The peer's endpoints are forgotten.
     LinkDown {
         /// The peer.
         daemon: DaemonId,
-        /// Why.
+        /// The reason.
         reason: String,
     },
-    /// A dial that was ordered came to nothing. Why is said by [`ToControl::Refusal`].
+    /// An ordered dial failed. [`ToControl::Refusal`] states the reason.
     DialFailed {
         /// The peer.
         daemon: DaemonId,
-        /// Why it may be there, as the order said it.
+        /// The confidence in the address, as the order stated it.
         standing: AddressConfidence,
     },
     /// Discovery datagrams that arrived at the QUIC port.
     Datagrams(Datagrams),
-    /// Somebody was refused, by this host or by the other.
+    /// A peer or an endpoint was refused, by this host or by the other.
     Refusal {
-        /// What is known of the other.
+        /// The kind of the refused party.
         kind: RefusalKind,
-        /// The other: a daemon id, SAE ID or address.
+        /// The refused party: a daemon id, SAE ID or address.
         peer: String,
-        /// What was refused, such as `handshake` or the variable that differs.
+        /// The refused step or setting, such as `handshake` or the variable that differs.
         what: String,
-        /// Why.
+        /// The reason.
         reason: String,
     },
-    /// Samples of a topic did not get to another host.
+    /// Samples of a topic did not reach another host.
     Lost {
         /// The topic.
         topic: String,
-        /// Why, as the status names it.
+        /// The cause, as the status names it.
         cause: &'static str,
-        /// How many.
+        /// The number of samples.
         samples: u64,
     },
-    /// Whether samples of publishers that ended are on their way to other hosts: the daemon does not
-    /// end meanwhile.
+    /// True while samples of ended publishers are on their way to other hosts. The daemon does not end meanwhile.
     Draining(bool),
-    /// The rules of the order with this number count: no pair is there that they deny.
+    /// The gateway applied the rules of the order with this number: no pair that they deny remains.
     Rules(u64),
     /// A peer answered a question about its access rules.
     Decisions {
         /// The number of the question.
         number: u64,
-        /// The peer's decisions. `None`: it is not linked.
+        /// The peer's decisions; `None` if the peer is not linked.
         decisions: Option<Vec<PeerDecision>>,
     },
-    /// What is to be shown of the key supply.
+    /// The key supply's part of the status.
     Keys(serde_json::Value),
-    /// What waited when the daemon was told to end has arrived, or does not get on: it may end.
+    /// After the order to end, the remaining samples arrived or make no progress: the daemon may end.
     Finished,
 }
 
-/// From the control plane to the gateway.
+/// An order from the control plane to the gateway.
 #[derive(Debug)]
 pub enum ToGateway {
     /// Connect to a peer. Answered by [`ToControl::LinkUp`] or [`ToControl::DialFailed`].
     Dial {
         /// The daemon expected there.
         daemon: DaemonId,
-        /// Its SAE ID, in qkd.
+        /// The daemon's SAE ID, in qkd.
         sae: Option<String>,
-        /// Where it may be, best first.
+        /// Addresses where the peer may be, best first.
         addresses: Vec<SocketAddr>,
-        /// Whether this host lists it as a static peer.
+        /// True if this host lists it as a static peer.
         listed: bool,
-        /// Why it may be there; the answer says it again.
+        /// The confidence in the addresses; the answer repeats it.
         standing: AddressConfidence,
     },
     /// Send a discovery datagram from the QUIC port.
     SendDatagram {
-        /// To whom.
+        /// The receiver's address.
         to: SocketAddr,
-        /// What.
+        /// The datagram.
         bytes: Vec<u8>,
     },
-    /// These rules count from now on. Answered by [`ToControl::Rules`] with this number.
+    /// Applies these rules from now on. Answered by [`ToControl::Rules`] with this number.
     Rules(TrafficRules, u64),
-    /// Ask a peer what its access rules let this host do. Answered by [`ToControl::Decisions`] once the peer answered.
+    /// Ask a peer which uses its access rules permit to this host. Answered by [`ToControl::Decisions`] once the peer
+    /// answered.
     CheckAccess {
         /// The peer.
         daemon: DaemonId,
-        /// A number for the question, used once.
+        /// The number of the question, used once.
         number: u64,
-        /// What this host would do.
+        /// The uses that this host would make.
         uses: Vec<CheckedUse>,
     },
-    /// These addresses are those of listed peers from now on.
+    /// Sets the addresses of listed peers.
     Listed(BTreeSet<IpAddr>),
-    /// Say when what waits to be sent has arrived: the daemon is to end.
+    /// Report when the waiting samples have arrived: the daemon is to end.
     Finish,
-    /// Say goodbye to every peer and return.
+    /// Say goodbye to every peer, then return.
     Shutdown,
 }

@@ -330,7 +330,7 @@ fn a_client_keeps_of_each_server_the_newest_responses_up_to_its_depth() {
 }
 
 #[test]
-fn twenty_clients_that_ask_at_once_are_all_answered_by_a_server_that_keeps_one() {
+fn server_of_depth_one_answers_twenty_clients_at_once() {
     let session = alone();
     let server = session.create_server(keeping(Some(1))).unwrap();
     let clients: Vec<_> = (0..CLIENTS).map(|_| session.create_client(spec()).unwrap()).collect();

@@ -128,7 +128,8 @@ impl fmt::Display for OwnLimit<'_> {
 }
 
 impl ShmError {
-    /// Returns the error of a system call that failed while it did `what`. For this project's crates.
+    /// Returns a function that makes the error of a failed system call. `what` names the purpose of the call. For this
+    /// project's crates.
     #[doc(hidden)]
     pub fn system(what: &'static str) -> impl FnOnce(Errno) -> Self {
         move |errno| Self::System { what, source: errno.into() }

@@ -1,8 +1,8 @@
-//! The outcome of the rules, and the rule that it comes from.
+//! The outcome of the rules, and the rule that decides.
 
 use std::{fmt, sync::Arc};
 
-/// Whether a party may do something, and why.
+/// The decision on an action of a party, and its reason.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Decision(pub(super) Reason);
 
@@ -10,25 +10,26 @@ pub struct Decision(pub(super) Reason);
 pub(super) enum Reason {
     /// There are no rules.
     NoRules,
-    /// No `[[allow]]` names the party, and no `[[deny]]` is against it.
+    /// No `[[allow]]` names the party, and no `[[deny]]` applies to it.
     Open { file: Arc<str> },
-    /// An `[[allow]]` names it and what it does.
+    /// An `[[allow]]` names the party and the action.
     Allowed { file: Arc<str>, line: u32 },
-    /// A `[[deny]]` does, or hides the topic or service, and no `[[allow]]` names what it does.
+    /// A `[[deny]]` names the party and the action. Or it hides the topic or service, and no `[[allow]]`
+    /// names the party.
     Denied { file: Arc<str>, line: u32 },
-    /// An `[[allow]]` names it, and none names what it does.
+    /// An `[[allow]]` names the party, and none names the action.
     NotAllowed { file: Arc<str> },
     /// `default = "deny"`, and no `[[allow]]` names the party.
     Default { file: Arc<str> },
 }
 
 impl Decision {
-    /// Whether it may.
+    /// Returns whether the party may do this.
     pub fn allowed(&self) -> bool {
         matches!(self.0, Reason::NoRules | Reason::Open { .. } | Reason::Allowed { .. })
     }
 
-    /// The line of the rule that decides, counted from 1; `None` where no single rule does.
+    /// Returns the line of the rule that decides, counted from 1, or `None` if no single rule decides.
     pub fn line(&self) -> Option<u32> {
         match self.0 {
             Reason::Allowed { line, .. } | Reason::Denied { line, .. } => Some(line),

@@ -1,14 +1,14 @@
-//! A short text by which two programs compare their rules.
+//! A short digest by which two programs compare their rules.
 
 use super::AccessRules;
 
 impl AccessRules {
-    /// A digest of the rules, limits and expectations, with their lines. It differs where they do, and is no protection
-    /// against somebody who looks for two rules with one digest. `None` where there are none. Programs of
-    /// other versions may have another one of the same rules.
+    /// Returns a digest of the rules, limits and expectations, with their lines, or `None` if there are none.
+    /// Different rules normally have different digests, but an attacker can construct two rule sets with the same
+    /// digest. Other versions of AXON may compute a different digest of the same rules.
     pub fn digest(&self) -> Option<String> {
         self.file()?;
-        // FNV-1a. The text names each field, and has no order that differs from run to run.
+        // FNV-1a. The text names each field, and its order is the same in each run.
         let text = format!("{:?} {:?} {:?}", self.rules, self.limits, self.interface_limits);
         let add = |hash: u64, byte: u8| (hash ^ u64::from(byte)).wrapping_mul(0x100_0000_01b3);
         Some(format!("{:016x}", text.bytes().fold(0xcbf2_9ce4_8422_2325, add)))

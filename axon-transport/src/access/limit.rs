@@ -1,35 +1,35 @@
-//! `[[limit]]`: how much a party may send here and get from here.
+//! `[[limit]]`: limits on the samples that a party sends to or receives from this host.
 
 use std::{fmt, num::NonZeroU32, sync::Arc};
 
 use super::{Principal, TopicPattern, Verb, party::PartyPattern, pattern::segment_fits};
 
-/// The samples that a limit lets pass. The time of a sample is that at which this host's daemon has it.
+/// A limit on the rate of samples. The time of a sample is the time at which this host's daemon has it.
 #[derive(Clone, Debug, PartialEq)]
 #[non_exhaustive]
 pub struct RateLimit {
-    /// Samples, or requests, a second.
+    /// Samples or requests per second.
     pub rate: Option<f64>,
-    /// Bytes of their payload a second.
+    /// Bytes of their payload per second.
     pub bytes: Option<f64>,
-    /// How many may pass at once after a pause.
+    /// Maximum number of samples that may pass at once after a pause.
     pub burst: NonZeroU32,
-    /// What becomes of the others.
+    /// The policy for the samples beyond the limit.
     pub overflow: Overflow,
-    /// Whether all topics together may have so much. Else each may.
+    /// True if the limit applies to all topics together; false if it applies to each topic.
     pub together: bool,
 }
 
 /// The policy for samples beyond a limit.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Overflow {
-    /// The newest waits until it may pass. It replaces the one that waited before.
+    /// The newest sample waits until it may pass. It replaces the sample that waited before.
     #[default]
     DropOldest,
-    /// They are dropped as they come.
+    /// Samples are dropped on arrival.
     DropNewest,
-    /// They wait for their turn. A KEEP_ALL publisher waits with them; of a KEEP_LAST publisher those within its depth
-    /// wait.
+    /// Samples wait for their turn. A KEEP_ALL publisher blocks meanwhile. For a KEEP_LAST publisher, the samples
+    /// within its history depth wait.
     Hold,
 }
 
@@ -37,7 +37,7 @@ impl Overflow {
     /// All policies.
     pub const ALL: [Self; 3] = [Self::DropOldest, Self::DropNewest, Self::Hold];
 
-    /// As rules spell it.
+    /// Returns the name in rules.
     pub const fn name(self) -> &'static str {
         match self {
             Self::DropOldest => "drop-oldest",
@@ -48,7 +48,7 @@ impl Overflow {
 }
 
 impl RateLimit {
-    /// So many samples a second of each topic, of which the newest waits for its turn.
+    /// Creates a limit of `rate` samples per second for each topic. The newest sample waits for its turn.
     pub(crate) fn of_rate(rate: f64) -> Self {
         let burst = NonZeroU32::MIN;
         Self {
@@ -78,7 +78,7 @@ impl fmt::Display for RateLimit {
     }
 }
 
-/// So many bytes a second, with a unit.
+/// Returns a number of bytes per second as text with a unit.
 fn bytes_text(bytes: f64) -> String {
     match bytes {
         b if b >= 1e6 => format!("{} MB/s", b / 1e6),
@@ -100,55 +100,55 @@ pub(super) struct LimitRule {
     pub(super) limits: LimitKind,
 }
 
-/// What a `[[limit]]` limits.
+/// The subject of a `[[limit]]`.
 #[derive(Debug)]
 pub(super) enum LimitKind {
-    /// What the party does, with which topics and services.
+    /// Actions of the party on topics and services.
     Uses(Vec<(Verb, TopicPattern)>, PlacedLimit),
-    /// All that is sent to it.
+    /// All output to the party.
     Egress(EgressLimit),
 }
 
-/// A `[[limit]]` of network interfaces: each interface that it names may send so much.
+/// A `[[limit]]` of network interfaces. It limits each interface that it names.
 #[derive(Clone, Debug, PartialEq)]
 #[non_exhaustive]
 pub struct InterfaceLimit {
-    /// The interfaces, in whose names `*` stands for any characters.
+    /// The interfaces. A `*` in a name stands for any characters.
     pub interfaces: Vec<String>,
-    /// What leaves by each of them, for all peers together.
+    /// Limit on the output of each interface, for all peers together.
     pub limit: EgressLimit,
 }
 
 impl InterfaceLimit {
-    /// Whether it names this interface.
+    /// Returns whether the limit names this interface.
     pub fn names(&self, interface: &str) -> bool {
         self.interfaces.iter().any(|pattern| segment_fits(pattern, interface))
     }
 }
 
-/// The bytes a second that leave this host for a party, or by an interface.
+/// A limit on the output of this host to a party, or by an interface.
 #[derive(Clone, Debug, PartialEq)]
 #[non_exhaustive]
 pub struct EgressLimit {
-    /// Bytes a second, with the headers of IP and UDP.
+    /// Bytes per second, including the headers of IP and UDP.
     pub bytes: f64,
-    /// The file, as decisions name it.
+    /// The name of the file in decisions.
     pub file: Arc<str>,
-    /// The line of the file.
+    /// The line in the file.
     pub line: u32,
 }
 
-/// A limit, and where it is written.
+/// A limit and its place in a file.
 #[derive(Clone, Debug, PartialEq)]
 #[non_exhaustive]
 pub struct PlacedLimit {
-    /// What it lets pass.
+    /// The limit.
     pub limit: RateLimit,
-    /// The topics and services of the entry as written there, in alphabetical order; `**` where it names none.
+    /// The topics and services of the entry as written there, in alphabetical order; `**` if it names none.
     pub names: Arc<str>,
-    /// The file, as decisions name it.
+    /// The name of the file in decisions.
     pub file: Arc<str>,
-    /// The line of the file.
+    /// The line in the file.
     pub line: u32,
 }
 
@@ -163,14 +163,14 @@ impl LimitRule {
         self.peers.iter().any(|peer| peer.fits(party))
     }
 
-    /// The limit, if it is on this use.
+    /// Returns the limit if it applies to this use.
     pub(super) fn of(&self, verb: Verb, name: &str) -> Option<&PlacedLimit> {
         let LimitKind::Uses(uses, limit) = &self.limits else { return None };
         let fits = uses.iter().any(|(used, pattern)| *used == verb && pattern.fits(name));
         fits.then_some(limit)
     }
 
-    /// The limit, if it is on all that is sent.
+    /// Returns the limit if it applies to all output.
     pub(super) fn egress(&self) -> Option<&EgressLimit> {
         match &self.limits {
             LimitKind::Egress(limit) => Some(limit),
@@ -178,7 +178,7 @@ impl LimitRule {
         }
     }
 
-    /// How decisions name the file.
+    /// Returns the name of the file in decisions.
     pub(super) fn file(&self) -> &str {
         match &self.limits {
             LimitKind::Uses(_, limit) => &limit.file,

@@ -1,9 +1,9 @@
-//! Access rules: which peer may publish, subscribe, serve, call and see what.
+//! Access rules: which topics and services a peer may publish, subscribe to, serve, call and see.
 //!
-//! A *party* is another host, by the name that it proved, or another user of this host. A rule is about what a
-//! party does here. Each daemon applies its own rules, so that either side alone protects itself. Rules come from
-//! `[[allow]]`, `[[deny]]` and `[[limit]]` in `axon.toml` or in the file that `AXON_ACCESS_FILE` names; `docs/access-control.md`
-//! describes them.
+//! A *party* is another host, by the name that it proved, or another user of this host. A rule applies to a party's
+//! actions on this host. Each daemon applies its own rules, so that either side alone protects itself. Rules come
+//! from `[[allow]]`, `[[deny]]` and `[[limit]]` in `axon.toml` or in the file that `AXON_ACCESS_FILE` names.
+//! `docs/access-control.md` describes them.
 //!
 //! ```
 //! use axon_transport::access::{AccessRules, Principal, Verb};
@@ -21,7 +21,7 @@
 //! assert!(rules.check(base, Verb::Publish, "/cmd_vel").allowed());
 //! let denied = rules.check(base, Verb::Publish, "/scan");
 //! assert_eq!(denied.to_string(), "denied: no [[allow]] in access.toml permits this");
-//! // A rule names the base station alone: nothing changes for others.
+//! // The rule names only the base station: nothing changes for other hosts.
 //! assert!(rules.check(Principal::Name("laptop"), Verb::Publish, "/scan").allowed());
 //! # Ok::<(), axon_transport::access::AccessError>(())
 //! ```

@@ -1,4 +1,4 @@
-//! Reads rules from TOML. Each error has its line and column.
+//! Parses rules from TOML. Each error has its line and column.
 
 pub(crate) mod limit;
 
@@ -16,14 +16,15 @@ use super::{
     rules::{Rule, RuleFile},
 };
 
-/// As many rules as a file may have.
+/// Maximum number of entries of one kind in a file.
 const MAX_RULES: usize = 4096;
-/// As many patterns and names as its rules may have together, those of actions and parameters counted one by one.
+/// Maximum number of patterns and names in all rules together. Each pattern that an action or a parameter expands to
+/// counts.
 const MOST_PATTERNS: usize = 65_536;
-/// The keys of a file that are rules. All others are settings of `axon.toml`.
+/// The keys of rules in a file. All other keys are settings of `axon.toml`.
 const KEYS: [&str; 5] = ["default", "allow", "deny", "limit", "expect"];
 
-/// Rules that cannot be used: what is wrong, and where.
+/// An error in access rules, with its place.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("line {line}, column {column} of {file}: {what}")]
 #[non_exhaustive]
@@ -34,28 +35,28 @@ pub struct AccessError {
     pub line: u32,
     /// The column in characters, counted from 1.
     pub column: u32,
-    /// What is wrong, and what is accepted.
+    /// The fault, and the accepted input.
     pub what: String,
 }
 
 impl AccessRules {
-    /// The rules of a file of their own. Decisions name the file as `file` does.
+    /// Parses a file that contains only rules. `file` is the name of the file in decisions.
     ///
     /// # Errors
-    /// The first thing that is wrong.
+    /// The first fault.
     pub fn parse(text: &str, file: &str) -> Result<Self, AccessError> {
         RuleFileReader::new(text, file).read(true)
     }
 
-    /// The rules of an `axon.toml`, whose other keys are not looked at.
+    /// Parses the rules of an `axon.toml`. Its other keys are ignored.
     ///
     /// # Errors
-    /// The first thing that is wrong with a rule.
+    /// The first fault of a rule.
     pub fn parse_among_settings(text: &str, file: &str) -> Result<Self, AccessError> {
         RuleFileReader::new(text, file).read(false)
     }
 
-    /// Whether a key at the top of an `axon.toml` is of rules.
+    /// Returns whether a top-level key of an `axon.toml` belongs to rules.
     pub(crate) fn is_key(key: &str) -> bool {
         KEYS.contains(&key)
     }
@@ -63,12 +64,12 @@ impl AccessRules {
 
 type Value<'i> = Spanned<DeValue<'i>>;
 
-/// A file that is being read.
+/// A parser of one file.
 struct RuleFileReader<'t> {
     text: &'t str,
     file: Arc<str>,
     patterns: usize,
-    /// Those of limits.
+    /// Number of patterns in limits.
     limited: usize,
 }
 
@@ -115,7 +116,7 @@ impl<'t> RuleFileReader<'t> {
                 _ => {}
             }
         }
-        // A file that is being written is empty for a moment: that must not let everything in.
+        // A file that is being written is empty for a moment. This must not allow everything.
         if alone && !found && limits.is_empty() {
             let what = "no rules; accepted: default, [[allow]], [[deny]], [[limit]]; to allow all, write \
                         default = \"allow\"";
@@ -138,7 +139,7 @@ impl<'t> RuleFileReader<'t> {
         self.wrong(value.span(), "").line
     }
 
-    /// The entries of an array of tables.
+    /// Returns the entries of an array of tables.
     fn tables<'v, 'i>(
         &self,
         value: &'v Value<'i>,
@@ -157,7 +158,7 @@ impl<'t> RuleFileReader<'t> {
         entries.iter().map(table).collect()
     }
 
-    /// A string, or an array of strings.
+    /// Returns a string, or the strings of an array.
     fn strings<'v>(
         &self,
         key: &str,
@@ -250,7 +251,7 @@ impl<'t> RuleFileReader<'t> {
                 format!("{header} without peer: write the names it is about, or peer = \"*\"");
             return Err(self.wrong(span, what));
         }
-        // An [[allow]] that lets its peers do nothing is a way to deny them everything.
+        // An [[allow]] without actions is valid: it denies everything to its peers.
         if rule.says.is_empty() && denies {
             let what = "[[deny]] that denies nothing; to deny all, write \
                         publish, subscribe, serve, call and see = \"**\"";
@@ -301,7 +302,7 @@ impl<'t> RuleFileReader<'t> {
     }
 }
 
-/// The line and the column, in characters, of a byte of a text, both counted from 1.
+/// Returns the line and the column of a byte of a text, both counted from 1. The column counts characters.
 pub(crate) fn position(text: &str, byte: usize) -> (usize, usize) {
     let before = text.get(..byte).unwrap_or(text);
     let column = before.rsplit('\n').next().unwrap_or("").chars().count() + 1;

@@ -4,17 +4,17 @@ use std::{fmt, net::IpAddr};
 
 use super::pattern::segment_fits;
 
-/// Another host or another user, as rules know it.
+/// Another host or another user, as rules identify it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Principal<'a> {
-    /// A host that proved to have this name: that of its pin, or its SAE ID.
+    /// A host that proved this name: the name of its pin, or its SAE ID.
     Name(&'a str),
     /// A host whose certificate has this name. Upper and lower case are the same.
     Certificate(&'a str),
-    /// A host that proved nothing, at this address.
+    /// A host that proved no name, at this address.
     Address(IpAddr),
-    /// A user of this host that is not the daemon's.
+    /// A user of this host other than the daemon's.
     User(u32),
 }
 
@@ -29,10 +29,10 @@ impl fmt::Display for Principal<'_> {
 }
 
 impl<'a> Principal<'a> {
-    /// The party that a text names as rules do: `uid:1001`, `address:10.0.0.7`, or a name.
+    /// Parses a party as rules name it: `uid:1001`, `address:10.0.0.7`, or a name.
     ///
     /// # Errors
-    /// The text is none of these; the error says what is accepted.
+    /// The text is none of them. The error describes the accepted text.
     pub fn parse(text: &'a str) -> Result<Self, &'static str> {
         match (text.strip_prefix("uid:"), text.strip_prefix("address:")) {
             (Some(uid), _) => uid.parse().map(Self::User).map_err(|_| "uid: and a number"),
@@ -62,8 +62,10 @@ pub(super) enum PartyPattern {
 }
 
 impl PartyPattern {
+    /// Parses an entry of `peer`.
+    ///
     /// # Errors
-    /// What would be one.
+    /// The accepted entries.
     pub(super) fn parse(text: &str) -> Result<Self, &'static str> {
         if text.is_empty() || text.len() > 255 || text.trim() != text {
             return Err(
@@ -83,7 +85,8 @@ impl PartyPattern {
         })
     }
 
-    /// Whether it speaks of a host by the name that the host proves, or by its address: only one of them can be known.
+    /// Returns the proven name or the address that the entry names, or `None` for all other entries. A security mode
+    /// knows hosts by only one of the two.
     pub(super) fn host(&self) -> Option<HostPattern<'_>> {
         match self {
             Self::Name(name) => Some(HostPattern::Name(name)),
@@ -110,23 +113,23 @@ impl PartyPattern {
 
 const KEYWORDS: &str = "local, uid: and address: in lower case";
 
-/// Whether a text would be a keyword in lower case, and is read as a host's name as it stands.
+/// Returns whether a text is a keyword except for its case. Rules would read it as a host's name.
 fn is_keyword_in_disguise(text: &str) -> bool {
     let lower = text.to_ascii_lowercase();
     let begins = |keyword| lower.starts_with(keyword) && !text.starts_with(keyword);
     begins("uid:") || begins("address:") || lower == "local" && text != "local"
 }
 
-/// How a rule speaks of a host.
+/// The property by which a rule identifies a host.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum HostPattern<'a> {
-    /// By the name that it proves.
+    /// The name that the host proves.
     Name(&'a str),
-    /// By its address, where it proves none.
+    /// The address of a host that proves no name.
     Address(&'a str),
 }
 
-/// An address in the form that addresses are compared in, or one in which `*` stands for any characters.
+/// Returns an address in canonical form, or a pattern of addresses in which `*` stands for any characters.
 fn address_pattern(text: &str) -> Result<String, &'static str> {
     const ACCEPTED: &str = "address: and an address, in which * stands for any characters";
     let is_part = |c: char| c.is_ascii_hexdigit() || ".:*".contains(c);

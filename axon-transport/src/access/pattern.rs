@@ -5,16 +5,17 @@ use std::fmt;
 /// The longest pattern, in bytes.
 const MAX_PATTERN_BYTES: usize = 1024;
 
-/// Names of topics, services and nodes: `*` stands for any characters but `/`, and `**` as a whole segment for any number
-/// of segments, none included. `**` alone fits each name, also one that does not begin with `/`.
+/// A pattern of names of topics, services and nodes. A `*` stands for any characters except `/`. A `**` as a whole
+/// segment stands for any number of segments, including none. `**` alone fits each name, even one that does not begin
+/// with `/`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TopicPattern(String);
 
 impl TopicPattern {
-    /// A pattern.
+    /// Parses a pattern.
     ///
     /// # Errors
-    /// The text is no pattern; the error says what is one.
+    /// The text is not a pattern. The error describes the accepted text.
     pub fn new(text: &str) -> Result<Self, &'static str> {
         if text.len() > MAX_PATTERN_BYTES {
             return Err("at most 1,024 bytes");
@@ -34,17 +35,17 @@ impl TopicPattern {
         Ok(Self(text.to_owned()))
     }
 
-    /// Its segments: those between slashes. The first is empty but for `**`.
+    /// Returns the segments between the slashes. The first one is empty, except in `**`.
     pub(super) fn segments(&self) -> impl Iterator<Item = &str> {
         self.0.split('/')
     }
 
-    /// The names that fit, each with a segment or more behind it.
+    /// Returns a pattern of the names that fit, each followed by `rest`, one segment or more.
     pub(super) fn below(&self, rest: &str) -> Self {
         Self(format!("{}/{rest}", self.0))
     }
 
-    /// Whether a name fits.
+    /// Returns whether a name fits.
     pub fn fits(&self, name: &str) -> bool {
         let pattern: Vec<_> = self.0.split('/').collect();
         let name: Vec<_> = name.split('/').collect();
@@ -63,13 +64,14 @@ impl fmt::Display for TopicPattern {
     }
 }
 
-/// Whether a segment of a name fits one of a pattern.
+/// Returns whether a segment of a name fits a segment of a pattern.
 pub(super) fn segment_fits(pattern: &str, name: &str) -> bool {
     fits(pattern.as_bytes(), name.as_bytes(), |byte| *byte == b'*', |byte, other| byte == other)
 }
 
-/// Whether `items` fit `pattern`, in which an item that `is_any` stands for any number of items. It tries the shortest
-/// run for each such item and lengthens the last one alone: so the time is the product of the lengths at most.
+/// Returns whether `items` fit `pattern`. An item of the pattern for which `is_any` holds stands for any number of
+/// items. The function tries the shortest run for each such item and lengthens only the last one. The time is
+/// therefore at most the product of the lengths.
 fn fits<P, T>(
     pattern: &[P],
     items: &[T],
@@ -77,7 +79,7 @@ fn fits<P, T>(
     is_one: impl Fn(&P, &T) -> bool,
 ) -> bool {
     let (mut at, mut item) = (0, 0);
-    // Behind the last item of the pattern that stands for any, and the items that it was tried with.
+    // The position after the last `is_any` item of the pattern, and the first of the items that were tried after it.
     let mut retry: Option<(usize, usize)> = None;
     while item < items.len() {
         match pattern.get(at) {
@@ -154,7 +156,7 @@ mod tests {
         assert!(!many.fits(&"/a".repeat(50_000)));
     }
 
-    /// The definition, in exponential time.
+    /// The reference definition, in exponential time.
     fn model(pattern: &[u8], name: &[u8]) -> bool {
         match (pattern.first(), name.first()) {
             (None, None) => true,

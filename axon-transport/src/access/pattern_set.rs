@@ -1,27 +1,27 @@
-//! Many patterns at once, so that the time for a name does not grow with their number.
+//! Matches a name with many patterns. The time does not grow with their number.
 
 use std::collections::HashMap;
 
 use super::{pattern::TopicPattern, starred_segments::StarredSegments};
 
-/// Patterns, each with the line that it stands in, as a tree of their segments.
+/// Patterns, each with its line, as a tree of their segments.
 #[derive(Debug)]
 pub(super) struct PatternSet {
-    /// The first is the root.
+    /// The nodes of the tree. The first is the root.
     nodes: Vec<PatternNode>,
 }
 
 #[derive(Debug, Default)]
 struct PatternNode {
-    /// The next segment, where it is plain text.
+    /// The next nodes for segments of plain text.
     literal: HashMap<Box<str>, usize>,
-    /// The next segment, where it has a `*`.
+    /// The next nodes for segments with a `*`.
     starred: StarredSegments,
-    /// The next segment, where it is `**`.
+    /// The next node for the segment `**`.
     any: Option<usize>,
-    /// It is behind `**`, which takes any number of segments.
+    /// True if the node follows `**`, which takes any number of segments.
     stays: bool,
-    /// The first line whose pattern ends here.
+    /// The first line with a pattern that ends here.
     line: Option<u32>,
 }
 
@@ -45,14 +45,14 @@ impl PatternSet {
         self.nodes.len() == 1
     }
 
-    /// Whether one pattern fits each name of ROS 2: `**` or `/**`.
+    /// Returns whether one pattern fits each name of ROS 2: `**` or `/**`.
     pub(super) fn fits_all(&self) -> bool {
         let any = |node: &PatternNode| node.any.is_some_and(|any| self.nodes[any].line.is_some());
         let [root, ..] = &self.nodes[..] else { return false };
         any(root) || root.literal.get("").is_some_and(|slash| any(&self.nodes[*slash]))
     }
 
-    /// The node of a segment behind a node.
+    /// Returns the node for a segment after a node. Adds it if there is none.
     fn child(&mut self, at: usize, segment: &str) -> usize {
         let node = &self.nodes[at];
         let known = match segment {
@@ -74,7 +74,7 @@ impl PatternSet {
         next
     }
 
-    /// The first line with a pattern that a name fits.
+    /// Returns the first line with a pattern that fits a name.
     pub(super) fn first_fit(&self, name: &str) -> Option<u32> {
         if self.is_empty() {
             return None;
@@ -100,7 +100,7 @@ impl PatternSet {
         at.iter().filter_map(|node| self.nodes[*node].line).min()
     }
 
-    /// A node is reached, and with it the one behind a `**` that takes no segment.
+    /// Records that a node is reached, and with it the node after a `**` that takes no segment.
     fn enter(&self, at: &mut Vec<usize>, node: usize) {
         let mut reached = Some(node);
         while let Some(node) = reached.filter(|node| !at.contains(node)) {

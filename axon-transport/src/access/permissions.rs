@@ -7,7 +7,8 @@ use super::{
     pattern_set::PatternSet,
 };
 
-/// What one party may do. Cheap to clone; the time of a decision does not grow with the number of rules.
+/// The permissions of one party. They are cheap to clone. The time of a decision does not grow with the number of
+/// rules.
 #[derive(Clone, Debug, Default)]
 pub struct Permissions {
     rules: Option<Arc<Compiled>>,
@@ -22,14 +23,14 @@ pub(super) struct Compiled {
     pub(super) otherwise: DefaultDecision,
 }
 
-/// What counts where no pattern fits.
+/// The decision if no pattern fits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum DefaultDecision {
     /// No `[[allow]]` names the party.
     Allow,
-    /// One does.
+    /// An `[[allow]]` names the party.
     NotAllowed,
-    /// None does, and the default is to deny.
+    /// No `[[allow]]` names the party, and the default is to deny.
     DenyByDefault,
 }
 
@@ -52,27 +53,27 @@ impl Permissions {
         Self { rules: rules.map(Arc::new), limits }
     }
 
-    /// Whether there are no rules that allow or deny anything.
+    /// Returns whether no rules allow or deny anything.
     pub fn are_unrestricted(&self) -> bool {
         self.rules.is_none()
     }
 
-    /// The limits that count when the party does this with a topic or service of this full name. Each of them counts.
+    /// Returns the limits on this use of the topic or service with this full name. Each limit applies.
     pub fn limits(&self, verb: Verb, name: &str) -> impl Iterator<Item = &PlacedLimit> {
         self.limits.iter().filter_map(move |limit| limit.of(verb, name))
     }
 
-    /// The limits on all that is sent to the party. Each of them counts.
+    /// Returns the limits on all output to the party. Each limit applies.
     pub fn egress(&self) -> impl Iterator<Item = &EgressLimit> {
         self.limits.iter().filter_map(|limit| limit.egress())
     }
 
-    /// Whether the party may do this with the topic, service or node of this full name.
+    /// Returns whether the party may do this with the topic, service or node of this full name.
     pub fn allows(&self, verb: Verb, name: &str) -> bool {
         self.are_unrestricted() || self.check(verb, name).allowed()
     }
 
-    /// Whether there is anything that the party may publish, subscribe to, serve or call.
+    /// Returns whether the party may publish, subscribe to, serve or call anything.
     pub(crate) fn allow_any_use(&self) -> bool {
         let Some(rules) = &self.rules else { return true };
         let open =
@@ -82,8 +83,8 @@ impl Permissions {
         })
     }
 
-    /// As [`allows`](Self::allows), with the rule that decides. A `[[deny]]` of [`Verb::See`] denies each use that no
-    /// `[[allow]]` names: an endpoint that is hidden cannot be used.
+    /// Like [`allows`](Self::allows), but returns the deciding rule, too. A `[[deny]]` of [`Verb::See`] denies each
+    /// use that no `[[allow]]` names, because a hidden endpoint cannot be used.
     pub fn check(&self, verb: Verb, name: &str) -> Decision {
         let Some(rules) = &self.rules else { return Decision(Reason::NoRules) };
         let file = || Arc::clone(&rules.file);

@@ -9,28 +9,28 @@ use super::{
     permissions::{Compiled, DefaultDecision, VerbPatterns},
 };
 
-/// What a party does with a topic, a service or a node.
+/// An action of a party on a topic, a service or a node.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Verb {
-    /// It publishes samples of a topic here.
+    /// The party publishes samples of a topic to this host.
     Publish,
-    /// It gets samples of a topic from here.
+    /// The party receives samples of a topic from this host.
     Subscribe,
-    /// It answers requests of clients here.
+    /// The party answers requests of clients on this host.
     Serve,
-    /// It sends requests to servers here.
+    /// The party sends requests to servers on this host.
     Call,
-    /// It is shown the nodes of this name, and the endpoints of topics and services of this name. A party that may
-    /// publish, subscribe, serve or call is shown the endpoints that it needs for that. A `[[deny]]` of it takes the
-    /// uses that no `[[allow]]` names, too.
+    /// The party sees the nodes of this name, and the endpoints of topics and services of this name. A party that may
+    /// publish, subscribe, serve or call also sees the endpoints that it needs for that. A `[[deny]]` of this verb
+    /// also denies the uses that no `[[allow]]` names.
     See,
 }
 
 impl Verb {
-    /// Each verb.
+    /// All verbs.
     pub const ALL: [Self; 5] = [Self::Publish, Self::Subscribe, Self::Serve, Self::Call, Self::See];
 
-    /// As rules spell it.
+    /// Returns the name in rules.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Publish => "publish",
@@ -48,7 +48,7 @@ impl fmt::Display for Verb {
     }
 }
 
-/// The access rules of a daemon; by default none, and everything is allowed.
+/// The access rules of a daemon. By default there are none, and everything is allowed.
 #[derive(Clone, Debug, Default)]
 pub struct AccessRules {
     pub(super) rules: Option<Arc<RuleFile>>,
@@ -58,7 +58,7 @@ pub struct AccessRules {
 
 #[derive(Debug)]
 pub(super) struct RuleFile {
-    /// How decisions name the file.
+    /// The name of the file in decisions.
     pub(super) file: Arc<str>,
     pub(super) denies_by_default: bool,
     pub(super) allow: Vec<Rule>,
@@ -70,7 +70,7 @@ pub(super) struct RuleFile {
 #[derive(Debug)]
 pub(super) struct Rule {
     pub(super) peers: Vec<PartyPattern>,
-    /// What it says, and the line that says it.
+    /// The uses that the rule names, each with its line.
     pub(super) says: Vec<(Verb, TopicPattern, u32)>,
 }
 
@@ -80,13 +80,13 @@ pub(super) struct Rule {
 pub struct Expectation {
     /// The party, as [`Principal::parse`] reads it.
     pub peer: String,
-    /// What it does.
+    /// The action.
     pub verb: Verb,
-    /// With what.
+    /// The name of the topic, service or node.
     pub name: String,
-    /// Whether it should be allowed.
+    /// True if the rules should allow this.
     pub allowed: bool,
-    /// The line that says so.
+    /// The line of the entry.
     pub line: u32,
 }
 
@@ -97,29 +97,29 @@ impl Rule {
 }
 
 impl AccessRules {
-    /// Whether there are none that allow or deny anything. There may be [limits](Self::limits_anything).
+    /// Returns whether no rules allow or deny anything. There may still be [limits](Self::limits_anything).
     pub fn is_empty(&self) -> bool {
         self.rules.is_none()
     }
 
-    /// Whether there is a `[[limit]]`.
+    /// Returns whether there is a `[[limit]]`.
     pub fn limits_anything(&self) -> bool {
         !self.limits.is_empty() || !self.interface_limits.is_empty()
     }
 
-    /// The limits on what leaves by network interfaces. Each that names an interface counts.
+    /// Returns the limits on the output by network interfaces. Each limit that names an interface applies to it.
     pub fn interface_limits(&self) -> &[InterfaceLimit] {
         &self.interface_limits
     }
 
-    /// How decisions name the file; `None` where there are no rules.
+    /// Returns the name of the file in decisions, or `None` without rules and limits.
     pub fn file(&self) -> Option<&str> {
         let peers = || self.limits.first().map(|limit| limit.file());
         let interfaces = || self.interface_limits.first().map(|limit| &*limit.limit.file);
         self.rules.as_ref().map(|rules| &*rules.file).or_else(peers).or_else(interfaces)
     }
 
-    /// What the rules let one party do. It takes the time of reading all rules once.
+    /// Returns the permissions of one party. This takes the time of reading all rules once.
     pub fn permissions(&self, party: Principal<'_>) -> Permissions {
         let limits = self.limits.iter().filter(|limit| limit.names(party)).cloned().collect();
         let Some(rules) = &self.rules else { return Permissions::new(None, limits) };
@@ -141,18 +141,18 @@ impl AccessRules {
         Permissions::new(Some(compiled), limits)
     }
 
-    /// Whether a party may do this with the topic, service or node of this full name, and which rule decides. To ask
-    /// more than once about one party, take its [`permissions`](Self::permissions).
+    /// Decides whether a party may do this with the topic, service or node of this full name, and by which rule. For
+    /// more than one decision about a party, use its [`permissions`](Self::permissions).
     pub fn check(&self, party: Principal<'_>, verb: Verb, name: &str) -> Decision {
         self.permissions(party).check(verb, name)
     }
 
-    /// The `[[expect]]` of the file.
+    /// Returns the entries `[[expect]]` of the file.
     pub fn expectations(&self) -> &[Expectation] {
         self.rules.as_ref().map_or(&[], |rules| &rules.expectations)
     }
 
-    /// The hosts that rules speak of.
+    /// Returns the hosts that rules and limits name.
     pub(crate) fn hosts(&self) -> impl Iterator<Item = HostPattern<'_>> {
         let rules = self.rules.iter().flat_map(|rules| rules.allow.iter().chain(&rules.deny));
         let limits = self.limits.iter().flat_map(|limit| &limit.peers);

@@ -1,23 +1,24 @@
-//! The segments with a `*` that may follow in a pattern, found by the text around their stars.
+//! An index of the segments with a `*` that may follow in a pattern, by the text around their stars.
 //!
-//! A segment that fits begins with the text before the first star and ends with that behind the last one. So patterns that
-//! differ in either are not tried, however many there are: one look for each pair of lengths of these texts.
+//! A segment that fits begins with the text before the first star, and ends with the text after the last star.
+//! Patterns that differ in either text are therefore not tried, whatever their number. A search makes one lookup for
+//! each pair of lengths of the two texts.
 
 use std::collections::HashMap;
 
 use super::pattern::segment_fits;
 
-/// Segments with a `*`, each with the number of what is behind it.
+/// Segments with a `*`, each with the number of the node that follows it.
 #[derive(Debug, Default)]
 pub(super) struct StarredSegments {
-    /// By the lengths of the text before the first star and of that behind the last one, in bytes.
+    /// Segments by the lengths, in bytes, of the text before the first star and of the text after the last star.
     lengths: Vec<(usize, usize, ByText)>,
 }
 
-/// By these texts, one behind the other.
+/// Segments by the two texts, joined.
 type ByText = HashMap<Box<[u8]>, Vec<(Box<str>, usize)>>;
 
-/// The text before the first star, and that behind the last one.
+/// Returns the text before the first star and the text after the last star.
 fn around(segment: &str) -> (&[u8], &[u8]) {
     let bytes = segment.as_bytes();
     let is_star = |byte: &u8| *byte == b'*';
@@ -27,7 +28,7 @@ fn around(segment: &str) -> (&[u8], &[u8]) {
 }
 
 impl StarredSegments {
-    /// What is behind this segment, if it is known.
+    /// Returns the node that follows this segment, if the segment is known.
     pub(super) fn get(&self, segment: &str) -> Option<usize> {
         let (before, behind) = around(segment);
         let by_text =
@@ -36,7 +37,7 @@ impl StarredSegments {
         same.iter().find(|(known, _)| **known == *segment).map(|(_, next)| *next)
     }
 
-    /// Adds a segment that is not known.
+    /// Adds a segment that is not yet known.
     pub(super) fn insert(&mut self, segment: &str, next: usize) {
         let (before, behind) = around(segment);
         let lengths = (before.len(), behind.len());
@@ -49,7 +50,7 @@ impl StarredSegments {
         self.lengths[at].2.entry(text).or_default().push((segment.into(), next));
     }
 
-    /// Names what is behind each segment that one of a name fits.
+    /// Calls `each` with the node that follows each segment of a pattern which fits a segment of a name.
     pub(super) fn each_fit(&self, name: &str, mut each: impl FnMut(usize)) {
         let bytes = name.as_bytes();
         let mut text = Vec::new();

@@ -13,7 +13,7 @@ fn error(text: &str) -> AccessError {
     AccessRules::parse(text, "access.toml").unwrap_err()
 }
 
-/// The example of the issue that asked for rules: a robot's.
+/// The robot example of the issue that requested rules.
 const ROBOT: &str = r#"
 [[allow]]
 peer = ["base", "sae-base", "operator-*"]
@@ -102,7 +102,7 @@ fn one_line_lets_a_peer_use_an_action_or_serve_it_or_set_parameters() {
 }
 
 #[test]
-fn a_denial_of_parameters_or_lifecycle_takes_the_services_of_the_node_and_nothing_else() {
+fn denied_parameters_or_lifecycle_block_only_these_services_of_the_node() {
     for (names, node) in [("true", "/robot/arm"), ("\"/robot/arm\"", "/robot/arm")] {
         let rules = rules(&format!(
             "[[deny]]\npeer = \"base\"\nparameters = {names}\n[[deny]]\npeer = \"manager\"\nlifecycle = {names}"
@@ -208,7 +208,7 @@ fn hostile_names_are_judged_as_they_are_written() {
         rules("default = \"deny\"\n[[allow]]\npeer = \"a\"\npublish = [\"/robot/*/x\", \"/ä/**\"]");
     let may = |name: &str| rules.check(Principal::Name("a"), Verb::Publish, name).allowed();
     assert!(may("/robot/arm/x") && may("/ä") && may("/ä/b/c"));
-    // The same letter, written in another way, is another name.
+    // The decomposed form of the same letter is a different name.
     assert!(!may("/a\u{308}/b"));
     for name in ["", "/", "//", "robot/arm/x", "/robot/arm/x/", "/robot/a/b/x", "/robot/arm/x\0"] {
         assert!(!may(name), "{name:?}");

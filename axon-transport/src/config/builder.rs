@@ -1,4 +1,4 @@
-//! A configuration that a program builds, in place of the environment or on top of it.
+//! A configuration that a program builds, instead of the environment or on top of it.
 
 use std::{fmt::Display, net::IpAddr, path::Path, time::Duration};
 
@@ -8,13 +8,13 @@ use super::{
     daemon_env::DaemonEnv, names, resolve::resolve, sources::Given, values::method,
 };
 
-/// Makes a [`Config`] in code. Each method sets the setting of `docs/configuration.md` that has its name:
+/// Builds a [`Config`] in code. Each method sets the setting of the same name in `docs/configuration.md`:
 /// [`kme_url`](Self::kme_url) is `AXON_KME_URL`, and `kme_url` of `axon.toml`.
 ///
-/// [`Config::builder`] starts from the defaults and reads no environment and no file; [`ConfigBuilder::from_env`]
-/// starts from what [`Config::from_env`] would read. [`build`](Self::build) validates all settings together, by the
-/// same rules as for the environment: a value that is refused there is refused here. A daemon that a session starts
-/// with the configuration gets the same settings.
+/// [`Config::builder`] starts from the defaults and reads no environment and no file. [`ConfigBuilder::from_env`]
+/// starts from the settings that [`Config::from_env`] would read. [`build`](Self::build) validates all settings
+/// together, by the same rules as for the environment. A daemon that a session starts with the configuration gets the
+/// same settings.
 ///
 /// ```
 /// use axon_transport::{
@@ -27,14 +27,14 @@ use super::{
 ///     .domain(7)
 ///     .ring_buffer_size_mb(16)
 ///     .daemon_peers(["robot-2", "10.0.0.7:61300"])
-///     // Without a daemon: nobody but this process is reached.
+///     // Without a daemon, the session reaches only this process.
 ///     .daemon(DaemonPolicy::Off)
 ///     .build()?;
 /// let session = Session::open(&config, SessionOptions::new("example"))?;
 /// let publisher = session.create_publisher(EndpointSpec::new("/t", "T", Qos::default()))?;
 /// publisher.publish(b"hello")?;
 ///
-/// // Half of what a mode needs is an error that names the setting that is missing.
+/// // An incomplete set of a mode's settings is an error that names the missing setting.
 /// let error = Config::builder().classic_key("/dev/null").build().unwrap_err();
 /// assert_eq!(error.variable(), "AXON_CLASSIC_TRUST");
 /// # Ok::<(), Box<dyn std::error::Error>>(())
@@ -44,7 +44,7 @@ use super::{
 pub struct ConfigBuilder {
     reads_environment: bool,
     given: Given,
-    /// The first value that cannot be written as a setting.
+    /// The first value that cannot be expressed as a setting.
     refused: Option<ConfigError>,
 }
 
@@ -66,17 +66,17 @@ impl Default for Config {
 }
 
 impl ConfigBuilder {
-    /// Returns a builder that starts from the environment and the `axon.toml` that [`Config::from_env`] would read, at
-    /// the time of [`build`](Self::build). Settings that are given to the builder win.
+    /// Returns a builder that starts from the environment and the `axon.toml` that [`Config::from_env`] would read.
+    /// [`build`](Self::build) reads both. Settings that are given to the builder win.
     pub fn from_env() -> Self {
         Self { reads_environment: true, ..Self::default() }
     }
 
-    /// Validates the settings, and returns the configuration.
+    /// Validates the settings and returns the configuration.
     ///
     /// # Errors
-    /// A setting that is wrong, half-given or without effect, by the name of its variable. Files that are
-    /// named must exist and have the right mode.
+    /// A setting is wrong, incomplete or without effect; the error names its variable. Files that the settings name
+    /// must exist and have the right mode.
     pub fn build(self) -> Result<Config, ConfigError> {
         let Self { reads_environment, given, refused } = self;
         if let Some(error) = refused {
@@ -91,7 +91,7 @@ impl ConfigBuilder {
         resolve([], &given, None, &OsFiles, daemon_env)
     }
 
-    /// The settings that were given.
+    /// Returns the names of the settings that were given.
     #[cfg(test)]
     pub(super) fn names(&self) -> Vec<&'static str> {
         self.given.keys().copied().collect()
@@ -115,7 +115,7 @@ impl ConfigBuilder {
         }
     }
 
-    /// Entries, none of which may be read as two or as something else.
+    /// Sets a list. Refuses an entry that could be read as two entries or as something else.
     fn list<T: Display>(self, name: &'static str, entries: impl IntoIterator<Item = T>) -> Self {
         let entries: Vec<String> = entries.into_iter().map(|entry| entry.to_string()).collect();
         let one = |entry: &&String| {
@@ -138,12 +138,12 @@ impl ConfigBuilder {
         self.set(name, time.as_secs())
     }
 
-    /// Sets how peers prove themselves and agree on keys. Default [`Classic`](SecurityMode::Classic).
+    /// Sets how peers authenticate and agree on keys. Default [`Classic`](SecurityMode::Classic).
     pub fn security_mode(self, mode: SecurityMode) -> Self {
         self.set("AXON_SECURITY_MODE", mode.name())
     }
 
-    /// Sets the one cipher that is offered. Default ChaCha20-Poly1305.
+    /// Sets the only cipher that is offered. Default ChaCha20-Poly1305.
     pub fn quic_cipher(self, cipher: QuicCipher) -> Self {
         self.set("AXON_QUIC_CIPHER", cipher.name())
     }
@@ -185,7 +185,7 @@ impl ConfigBuilder {
         self.set("AXON_QKD_KEY_MODE", mode.name())
     }
 
-    /// Sets the key exchange beside the KME key. Default `psk_ke`, none.
+    /// Sets the key exchange beside the KME key. Default [`PskKe`](QkdKex::PskKe), no key exchange.
     pub fn qkd_kex(self, kex: QkdKex) -> Self {
         self.set("AXON_QKD_KEX", kex.name())
     }
@@ -199,7 +199,8 @@ impl ConfigBuilder {
         }
     }
 
-    /// Sets the age at which a connection is made anew under a new key, in whole seconds up to a day. Default one hour.
+    /// Sets the age at which a connection is replaced by one under a new key, in whole seconds up to a day. Default
+    /// one hour.
     pub fn qkd_session_max_age(self, age: Duration) -> Self {
         self.seconds("AXON_QKD_SESSION_MAX_AGE", age)
     }
@@ -214,7 +215,7 @@ impl ConfigBuilder {
         self.path("AXON_KME_CA", file)
     }
 
-    /// Sets the common name that the KME's certificate must also have. By default it is not checked.
+    /// Sets the common name that the KME's certificate must also have. By default, the client does not check it.
     pub fn kme_id(self, id: impl Into<String>) -> Self {
         self.set("AXON_KME_ID", id.into())
     }
@@ -250,18 +251,18 @@ impl ConfigBuilder {
         self.path("AXON_SAE_KEY", file)
     }
 
-    /// Sets what a session does about its daemon. Default [`Spawn`](DaemonPolicy::Spawn).
+    /// Sets whether a session starts, requires or does not use a daemon. Default [`Spawn`](DaemonPolicy::Spawn).
     pub fn daemon(self, policy: DaemonPolicy) -> Self {
         self.set("AXON_DAEMON", policy.name())
     }
 
-    /// Sets the daemon's program. By default it is looked for as `docs/configuration.md` describes.
+    /// Sets the daemon's program. By default, the session searches for it as `docs/configuration.md` describes.
     pub fn daemon_path(self, program: impl AsRef<Path>) -> Self {
         self.path("AXON_DAEMON_PATH", program)
     }
 
-    /// Sets the absolute path of the directory for the daemon's files and the session socket. Default none: the daemon
-    /// has only an abstract name, and keeps no files.
+    /// Sets the absolute path of the directory for the daemon's files and the session socket. Default none: the
+    /// daemon then has only an abstract name, and keeps no files.
     pub fn runtime_dir(self, directory: impl AsRef<Path>) -> Self {
         self.path("AXON_RUNTIME_DIR", directory)
     }
@@ -291,7 +292,7 @@ impl ConfigBuilder {
         self.set("AXON_SHM_COPY", u8::from(copy))
     }
 
-    /// Sets the users beside this one whose daemon and sessions are trusted. Default none.
+    /// Sets the users, besides the own one, whose daemon and sessions are trusted. Default none.
     pub fn trusted_uids(self, uids: impl IntoIterator<Item = u32>) -> Self {
         self.list("AXON_TRUSTED_UIDS", uids)
     }
@@ -301,12 +302,12 @@ impl ConfigBuilder {
         self.path("AXON_ACCESS_FILE", file)
     }
 
-    /// Sets what the daemon logs: levels or `target=level`, separated by commas. Default `warn`.
+    /// Sets the daemon's log filter: levels or `target=level`, separated by commas. Default `warn`.
     pub fn log(self, filter: impl Into<String>) -> Self {
         self.set("AXON_LOG", filter.into())
     }
 
-    /// Sets an `axon.toml` to read; settings that are given to the builder win over it. Default none from
+    /// Sets an `axon.toml` to read. Settings that are given to the builder win over it. Default none from
     /// [`Config::builder`].
     pub fn config(self, file: impl AsRef<Path>) -> Self {
         self.path(names::CONFIG, file)
@@ -317,12 +318,12 @@ impl ConfigBuilder {
         self.list("AXON_BIND_ADDRS", addresses)
     }
 
-    /// Sets the peers to try beside those that discovery finds: `host`, `host:port` or `[IPv6]:port`, up to 64.
+    /// Sets the peers to try besides those that discovery finds: `host`, `host:port` or `[IPv6]:port`, up to 64.
     pub fn daemon_peers(self, peers: impl IntoIterator<Item = impl Into<String>>) -> Self {
         self.list("AXON_DAEMON_PEERS", peers.into_iter().map(Into::into))
     }
 
-    /// Sets the addresses to state in beacons, up to 4. Default those of the interfaces.
+    /// Sets the addresses to state in beacons, up to 4. Default the addresses of the interfaces.
     pub fn advertise_addrs(self, addresses: impl IntoIterator<Item = IpAddr>) -> Self {
         self.list("AXON_ADVERTISE_ADDRS", addresses)
     }
@@ -332,10 +333,10 @@ impl ConfigBuilder {
         self.set("ROS_DOMAIN_ID", domain)
     }
 
-    /// Sets how far a session is discovered (`ROS_AUTOMATIC_DISCOVERY_RANGE`). Default
+    /// Sets the discovery range of a session (`ROS_AUTOMATIC_DISCOVERY_RANGE`). Default
     /// [`Subnet`](DiscoveryRange::Subnet).
     pub fn discovery_range(mut self, range: DiscoveryRange) -> Self {
-        // It would win.
+        // `ROS_LOCALHOST_ONLY=1` would win over the range.
         self.given.insert("ROS_LOCALHOST_ONLY", None);
         self.set("ROS_AUTOMATIC_DISCOVERY_RANGE", range.name())
     }
@@ -345,13 +346,13 @@ impl ConfigBuilder {
         self.list("ROS_STATIC_PEERS", peers.into_iter().map(Into::into))
     }
 
-    /// Sets the time that a daemon which a session started outlives its last session, in whole seconds up to a day.
-    /// Default 10 s.
+    /// Sets the time for which a daemon that a session started outlives its last session, in whole seconds up to a
+    /// day. Default 10 s.
     pub fn link_grace(self, time: Duration) -> Self {
         self.seconds("AXON_LINK_GRACE_S", time)
     }
 
-    /// Sets the time after which a peer that takes nothing of a KEEP_ALL topic is disconnected from it, in whole
+    /// Sets the time after which a peer that reads nothing of a KEEP_ALL topic is disconnected from it, in whole
     /// seconds from 1 s to a day. Default 10 s.
     pub fn link_stalled(self, time: Duration) -> Self {
         self.seconds("AXON_LINK_STALLED_S", time)
@@ -367,13 +368,13 @@ impl ConfigBuilder {
         self.set("AXON_LINK_GRAPH_MB", mib)
     }
 
-    /// Sets the memory for the samples and calls of one peer that are kept here for readers and servers, 16 to
+    /// Sets the memory for one peer's samples and calls that this host keeps for its readers and servers, 16 to
     /// 1,048,576 MiB. Default 2,048.
     pub fn link_held_mb(self, mib: u64) -> Self {
         self.set("AXON_LINK_HELD_MB", mib)
     }
 
-    /// Sets whether the daemon looks for the next input before it sleeps. Default [`LinkPoll::Adaptive`].
+    /// Sets whether the daemon polls for the next input before it sleeps. Default [`LinkPoll::Adaptive`].
     pub fn link_poll(self, poll: LinkPoll) -> Self {
         let word = match poll {
             LinkPoll::Adaptive => "adaptive",
@@ -383,7 +384,7 @@ impl ConfigBuilder {
         self.set("AXON_LINK_POLL", word)
     }
 
-    /// Sets the absolute path of the directory to which the daemon writes QUIC's events. Default none.
+    /// Sets the absolute path of the directory for QUIC's events, which the daemon writes. Default none.
     pub fn link_qlog(self, directory: impl AsRef<Path>) -> Self {
         self.path("AXON_LINK_QLOG", directory)
     }
@@ -399,7 +400,7 @@ impl ConfigBuilder {
         self.set("AXON_LINK_CONGESTION", word)
     }
 
-    /// Sets whether samples are compressed for other hosts. Default [`LinkCompression::Auto`].
+    /// Sets whether the daemon compresses samples for other hosts. Default [`LinkCompression::Auto`].
     pub fn link_compression(self, compression: LinkCompression) -> Self {
         let word = match compression {
             LinkCompression::Auto => "auto",

@@ -12,15 +12,15 @@ use super::{files::Files, names, sources::FOREIGN};
 /// The variables of a daemon that a session starts.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct DaemonEnv {
-    /// Whether it gets the settings in the session's environment too, as they are when it is started.
+    /// True if the daemon also inherits the settings in the session's environment, as they are when it is started.
     pub(crate) inherits: bool,
-    /// Variables that have this value, or none, whatever the session's environment says.
+    /// Variables that have this value, or are unset, whatever the session's environment says.
     pub(crate) variables: BTreeMap<OsString, Option<OsString>>,
 }
 
 impl DaemonEnv {
-    /// The settings of a session that did not read the environment: these alone, and no `axon.toml` but
-    /// `file`.
+    /// Returns the environment for a session that did not read its own: these settings alone, and no `axon.toml`
+    /// except `file`.
     pub(super) fn whole(
         settings: impl IntoIterator<Item = (OsString, OsString)>,
         file: Option<&Path>,
@@ -38,7 +38,7 @@ impl DaemonEnv {
         Self { inherits: false, variables }.absolute(files)
     }
 
-    /// The session's environment, with these variables in place of its own.
+    /// Returns the session's environment with these variables replaced.
     pub(super) fn inherited(
         variables: impl IntoIterator<Item = (&'static str, Option<OsString>)>,
         files: &impl Files,
@@ -47,7 +47,7 @@ impl DaemonEnv {
         Self { inherits: true, variables }.absolute(files)
     }
 
-    /// The session's process may be in another directory by the time it starts a daemon.
+    /// Makes paths absolute, because the session's process may be in another directory when it starts a daemon.
     fn absolute(mut self, files: &impl Files) -> Self {
         let Ok(directory) = files.current_dir() else { return self };
         for name in names::PATHS {

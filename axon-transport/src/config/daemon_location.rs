@@ -13,8 +13,9 @@ use super::{
     values::Values,
 };
 
-/// Where the daemon of this user and domain listens, and whose it may be. It is known although other
-/// settings, or the files that they name, are wrong: for tools that look at a daemon, and open no session.
+/// The location of the daemon of this user and domain, and the users who may run it. The location is valid even if
+/// other settings, or the files that they name, are wrong. Tools use it to inspect a daemon without opening a
+/// session.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct DaemonLocation {
     pub(super) domain: u32,
@@ -24,11 +25,12 @@ pub struct DaemonLocation {
 }
 
 impl DaemonLocation {
-    /// The place by the environment of this process and the `axon.toml` that [`Config::from_env`] would
-    /// read. A file that cannot be read, or that is no TOML, counts as none.
+    /// Returns the location by the environment of this process and the `axon.toml` that [`Config::from_env`] would
+    /// read. A file that cannot be read, or that is not TOML, counts as absent.
     ///
     /// # Errors
-    /// `ROS_DOMAIN_ID`, `AXON_RUNTIME_DIR` or `AXON_TRUSTED_UIDS` is wrong.
+    /// `ROS_DOMAIN_ID`, `AXON_RUNTIME_DIR` or `AXON_TRUSTED_UIDS` is wrong. In a process with more rights than its
+    /// caller, a variable that names programs, files or trusted users is an error, too.
     pub fn from_env() -> Result<Self, ConfigError> {
         let variables = environment()?;
         let named = variables.get::<std::ffi::OsStr>("AXON_DAEMON_PATH".as_ref()).map(Path::new);
@@ -36,10 +38,11 @@ impl DaemonLocation {
         Self::resolve(variables, file.as_deref(), &OsFiles)
     }
 
-    /// The same by another environment, with `default_file` where it names no file.
+    /// Like [`from_env`](Self::from_env), with another environment. Reads `default_file` if the environment names no
+    /// file.
     ///
     /// # Errors
-    /// As [`from_env`](Self::from_env).
+    /// The errors of [`from_env`](Self::from_env).
     pub fn resolve(
         env: impl IntoIterator<Item = (OsString, OsString)>,
         default_file: Option<&Path>,
@@ -57,7 +60,7 @@ impl DaemonLocation {
         })
     }
 
-    /// A configuration that finds this daemon, and is for nothing else: the rest of it are defaults.
+    /// Returns a configuration that only locates this daemon. All other settings are defaults.
     pub(crate) fn config(&self) -> Config {
         let Self { domain, runtime_dir, socket_in_runtime_dir, trusted_uids } = self.clone();
         Config { domain, runtime_dir, socket_in_runtime_dir, trusted_uids, ..Config::default() }

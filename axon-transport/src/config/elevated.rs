@@ -13,7 +13,7 @@ use std::{
 
 use super::{ConfigError, names};
 
-/// Settings that name programs, files, directories, or users who are let in.
+/// Returns the settings that name programs, files, directories or trusted users.
 fn refused() -> impl Iterator<Item = &'static str> {
     names::PATHS.iter().copied().chain([names::RUNTIME_DIR, names::TRUSTED_UIDS, names::QLOG])
 }
@@ -22,29 +22,29 @@ const ACCEPTED: &str = "nothing from the environment: this program runs with mor
                         (set-uid, set-gid or file capabilities; AT_SECURE). Unset it, and write it into \
                         an axon.toml beside the daemon's program";
 
-/// Takes what such a program must not take out of its environment.
+/// Refuses the settings of `refused`, and removes `XDG_RUNTIME_DIR`.
 ///
 /// # Errors
-/// A setting of the caller's that names a program or a file.
+/// The caller set one of these settings.
 pub(super) fn restrict(variables: &mut BTreeMap<OsString, OsString>) -> Result<(), ConfigError> {
     for name in refused() {
         if let Some(value) = variables.get(OsStr::new(name)) {
             return Err(ConfigError::value(name, &value.to_string_lossy(), ACCEPTED));
         }
     }
-    // Every login sets it, so that it is no error: the directory is just not used.
+    // Every login sets this variable, so it is not an error. The program does not use the directory.
     variables.remove(OsStr::new("XDG_RUNTIME_DIR"));
     Ok(())
 }
 
-/// The `axon.toml` that nobody named, unless the caller could have put it there: a hard link makes the
-/// program stand in a directory of its caller's.
+/// Checks that the caller cannot replace the default `axon.toml`. Through a hard link, the program can
+/// stand in a directory of its caller.
 ///
 /// # Errors
-/// Somebody else could have written it.
+/// Another user could have written the file.
 pub(super) fn check_default_file(file: &Path) -> Result<(), ConfigError> {
     match std::fs::symlink_metadata(file) {
-        // There is none, or it cannot be read either.
+        // The file is absent, or the program cannot read it either.
         Err(_) => Ok(()),
         Ok(_) => check_owner(file).map_err(|why| {
             let accepted = format!("a file that the caller of this program cannot replace: {why}");
@@ -53,11 +53,11 @@ pub(super) fn check_default_file(file: &Path) -> Result<(), ConfigError> {
     }
 }
 
-/// Checks that nobody but root, and the user whose rights this process has been given, can replace a
-/// file: by its owner and mode, and those of all directories above it.
+/// Checks that only root, and the user whose rights this process has been given, can replace a file. Checks
+/// the owner and mode of the file and of all directories above it.
 ///
 /// # Errors
-/// What is wrong, and where.
+/// The fault and its path.
 pub(crate) fn check_owner(path: &Path) -> Result<(), String> {
     if !path.is_absolute() {
         return Err(format!("{} is no absolute path", path.display()));
@@ -72,7 +72,7 @@ pub(crate) fn check_owner(path: &Path) -> Result<(), String> {
         if facts.uid() != 0 && given.is_none_or(|given| facts.uid() != given.as_raw()) {
             return Err(format!("{shown} is user {}'s", facts.uid()));
         }
-        // In a directory with the sticky bit only a file's owner replaces it.
+        // In a directory with the sticky bit, only a file's owner can replace it.
         let sticky = facts.is_dir() && facts.mode() & 0o1000 != 0;
         if facts.mode() & 0o022 != 0 && !sticky {
             return Err(format!("others may write {shown}"));
@@ -111,7 +111,7 @@ mod tests {
         assert!(!rest.contains_key(OsStr::new("XDG_RUNTIME_DIR")) && rest.len() == 3);
     }
 
-    /// A setting that is added must be looked at: does its value name a path?
+    /// A new setting must be checked: does its value name a path?
     #[test]
     fn no_setting_is_forgotten() {
         let paths = ["_KEY", "_TRUST", "_CA", "_CERT", "_CRL", "_PATH", "_DIR", "_FILE", "_CONFIG"];

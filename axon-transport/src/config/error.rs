@@ -4,9 +4,10 @@ use std::fmt::{self, Write as _};
 
 use crate::{access::AccessError, text::is_plain};
 
-/// A setting that was refused: which one, what was read, what is accepted.
+/// A refused setting: its name, the value that was read, and the accepted values.
 ///
-/// Its `Display` is one line and never shows a secret; a program that meets it ends with status 2.
+/// The `Display` text is one line and never shows a secret. A program that gets this error exits with
+/// status 2.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ConfigError {
     variable: String,
@@ -15,16 +16,16 @@ pub struct ConfigError {
     accepted: String,
 }
 
-/// What stood where a good value should be.
+/// The refused input.
 #[derive(Clone, Debug, PartialEq, Eq)]
 enum Read {
     Value(String),
     Missing,
-    /// Set, but not to be repeated: it may be a secret.
+    /// The setting has a value that is not shown, because it may be a secret.
     Withheld,
     /// The name itself is wrong.
     Name,
-    /// Something in a file that holds more than settings, at this place.
+    /// An access rule, at this place in its file.
     Place(String),
 }
 
@@ -45,13 +46,13 @@ impl ConfigError {
         Self::new(variable, Read::Name, accepted)
     }
 
-    /// Says where the setting stands when that is not the environment.
+    /// Sets the source of the setting if it is not the environment.
     pub(super) fn at(mut self, place: impl Into<String>) -> Self {
         self.place = Some(place.into());
         self
     }
 
-    /// Access rules that cannot be used.
+    /// Creates the error for access rules that cannot be used.
     pub(super) fn rules(variable: &str, error: &AccessError) -> Self {
         let place = format!("line {}, column {}", error.line, error.column);
         Self::new(variable, Read::Place(place), &*error.what)
@@ -61,13 +62,14 @@ impl ConfigError {
         Self { variable: variable.to_owned(), place: None, read, accepted: accepted.into() }
     }
 
-    /// The setting's `AXON_` name (or `ROS_DOMAIN_ID`, or `link.mtu` and the like), whether it came
-    /// from the environment or from `axon.toml`.
+    /// Returns the setting's `AXON_` name (or `ROS_DOMAIN_ID`, `link.mtu` and the like). The name is the
+    /// same for the environment and for `axon.toml`.
     pub fn variable(&self) -> &str {
         &self.variable
     }
 
-    /// What was read; `None` where nothing was, and where it may be a secret.
+    /// Returns the value that was read. `None` if there was no value, if the value may be a secret, or if
+    /// the error is about a name or an access rule.
     pub fn read(&self) -> Option<&str> {
         match &self.read {
             Read::Value(text) => Some(text),
@@ -75,7 +77,7 @@ impl ConfigError {
         }
     }
 
-    /// What would have been accepted, and what to do.
+    /// Returns the accepted values and the remedy.
     pub fn accepted(&self) -> &str {
         &self.accepted
     }
@@ -92,7 +94,7 @@ impl fmt::Display for ConfigError {
             Read::Missing => f.write_str(": not set")?,
             Read::Withheld => f.write_str(": set (value not shown)")?,
             Read::Name => f.write_str(": unknown name")?,
-            // What is accepted there is a sentence of its own.
+            // For an access rule, `accepted` is a complete sentence.
             Read::Place(at) => return write!(f, ": {at}: {}", OneLine(&self.accepted)),
         }
         write!(f, ", accepted: {}", OneLine(&self.accepted))
@@ -101,7 +103,7 @@ impl fmt::Display for ConfigError {
 
 impl std::error::Error for ConfigError {}
 
-/// Text from outside, escaped and cut so that it stays on one line of bearable length.
+/// External text, escaped and truncated so that it stays on one line.
 struct OneLine<'a>(&'a str);
 
 impl fmt::Display for OneLine<'_> {
@@ -109,7 +111,7 @@ impl fmt::Display for OneLine<'_> {
         const LONGEST: usize = 400;
         let mut chars = self.0.chars();
         for c in chars.by_ref().take(LONGEST) {
-            // Quotes stay readable; control characters, line breaks and bidi marks do not get through.
+            // Quotes stay readable. Control characters, line breaks and bidi marks are escaped.
             if is_plain(c) {
                 f.write_char(c)?;
             } else {

@@ -10,22 +10,22 @@ use std::{
 /// Largest file that validation reads, in bytes.
 pub(super) const LARGEST: u64 = 4 << 20;
 
-/// The file system as [`Config::resolve`](super::Config::resolve) sees it. Nothing here writes.
+/// The file system as [`Config::resolve`](super::Config::resolve) reads it. No method writes.
 pub trait Files {
-    /// The whole content of `path`, an error when it is larger than 4 MiB.
+    /// Returns the whole content of `path`. A file larger than 4 MiB is an error.
     fn read(&self, path: &Path) -> io::Result<Vec<u8>>;
 
-    /// What kind of file `path` is, links followed.
+    /// Returns the kind and mode of the file at `path`. Follows links.
     fn facts(&self, path: &Path) -> io::Result<FileFacts>;
 
-    /// Whether this process may read `path`.
+    /// Checks that this process may read `path`.
     fn readable(&self, path: &Path) -> io::Result<()>;
 
-    /// What relative paths in the environment are relative to.
+    /// Returns the directory that relative paths in the environment are relative to.
     fn current_dir(&self) -> io::Result<PathBuf>;
 }
 
-/// What `stat` says of a file.
+/// The result of `stat` for a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct FileFacts {
@@ -36,13 +36,13 @@ pub struct FileFacts {
 }
 
 impl FileFacts {
-    /// The facts of a file of this kind, with these permission bits.
+    /// Creates the facts of a file of this kind, with these permission bits.
     pub fn new(kind: FileKind, mode: u32) -> Self {
         Self { kind, mode }
     }
 }
 
-/// What a path leads to.
+/// The kind of the file that a path leads to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FileKind {
     /// A regular file.
@@ -90,7 +90,7 @@ fn kind(metadata: &Metadata) -> FileKind {
     }
 }
 
-/// Opens without ever waiting: a pipe put in a file's place must not hang the start.
+/// Opens a file without blocking: a pipe in a file's place must not hang the start.
 fn open(path: &Path) -> io::Result<File> {
     const O_NONBLOCK: i32 = rustix::fs::OFlags::NONBLOCK.bits() as i32;
     OpenOptions::new().read(true).custom_flags(O_NONBLOCK).open(path)

@@ -15,12 +15,12 @@ use std::{
 
 mod builder;
 mod daemon_env;
+mod daemon_location;
 pub(crate) mod elevated;
 mod error;
 mod files;
 mod model;
 mod names;
-mod place;
 mod resolve;
 pub(crate) mod rules_file;
 mod sources;
@@ -37,6 +37,7 @@ pub use crate::access::TopicPattern;
 pub use builder::ConfigBuilder;
 pub use error::ConfigError;
 // `Config::resolve` reads files through these types, and the project's tests replace them. For this project's crates.
+pub use daemon_location::DaemonLocation;
 #[doc(hidden)]
 pub use files::{FileFacts, FileKind, Files, OsFiles};
 pub use model::{
@@ -44,27 +45,27 @@ pub use model::{
     LinkCompression, LinkConfig, LinkPoll, PeerAddress, QkdConfig, QkdKex, QkdPeers, QuicCipher,
     Security, SecurityMode,
 };
-pub use place::DaemonLocation;
 pub use summary::security_settings;
 pub use topics::{TopicPriority, TopicRule};
 
 impl Config {
-    /// The configuration of this process: its environment, and the `axon.toml` that `AXON_CONFIG`
-    /// names, else the one beside the daemon (`AXON_DAEMON_PATH`, or this very program), if any.
+    /// Returns the configuration of this process from its environment and an `axon.toml`. That is the file that
+    /// `AXON_CONFIG` names. Otherwise, it is the file beside the daemon (`AXON_DAEMON_PATH`, or this program), if
+    /// there is one.
     ///
-    /// A process that has more rights than its caller (set-uid, set-gid, file capabilities) takes no
-    /// programs, files or users to trust from its environment: they are errors.
+    /// A process with more rights than its caller (set-uid, set-gid or file capabilities) takes no programs, files or
+    /// trusted users from its environment. Such settings are errors.
     pub fn from_env() -> Result<Self, ConfigError> {
         Self::from_env_with([], None)
     }
 
-    /// As [`from_env`](Self::from_env), for a library that knows where its daemon is installed.
+    /// Like [`from_env`](Self::from_env), for a library that knows where its daemon is installed.
     pub fn from_env_beside(daemon: &Path) -> Result<Self, ConfigError> {
         Self::from_env_with([], Some(daemon))
     }
 
-    /// As [`from_env`](Self::from_env), where these variables have another value than the
-    /// environment's, or none; for a library that may know where its daemon is installed.
+    /// Like [`from_env`](Self::from_env), with other values of some variables, or without them. For a library that
+    /// may know where its daemon is installed.
     pub fn from_env_with(
         overrides: impl IntoIterator<Item = (&'static str, Option<OsString>)>,
         daemon: Option<&Path>,
@@ -82,7 +83,7 @@ impl Config {
         resolve::resolve(variables, &Given::new(), file.as_deref(), &OsFiles, daemon_env)
     }
 
-    /// The configuration of this process, where a builder was given some of it.
+    /// Returns the configuration of this process, with the values that a builder was given.
     fn from_environment(given: Given) -> Result<Self, ConfigError> {
         let variables = environment()?;
         let daemon = match given.get(DAEMON_PATH) {
@@ -95,9 +96,9 @@ impl Config {
         resolve::resolve(variables, &given, file.as_deref(), &OsFiles, daemon_env)
     }
 
-    /// The configuration that an environment makes, with `default_file` where it names no file. The
-    /// environment of this process is not read, and a daemon that a session starts with the configuration
-    /// does not get it either. [`builder`](Self::builder) does the same with a method for each setting.
+    /// Returns the configuration of an environment. Reads `default_file` if the environment names no file. This
+    /// function does not read the environment of this process, and a daemon that a session starts with the
+    /// configuration does not inherit it. [`builder`](Self::builder) does the same with a method for each setting.
     ///
     /// ```
     /// use axon_transport::config::{Config, OsFiles, Security};
@@ -122,7 +123,7 @@ impl Config {
         resolve::resolve(env, &Given::new(), default_file, files, daemon_env)
     }
 
-    /// The warnings that a process started with this configuration should show once.
+    /// Returns the warnings that a process with this configuration should show once.
     pub fn warnings(&self) -> Vec<String> {
         let mut warnings = Vec::new();
         match &self.security {
@@ -149,7 +150,7 @@ impl Config {
         warnings
     }
 
-    /// What to say about variables that begin with `AXON_` and are no settings: one line, or nothing.
+    /// Returns a line about the variables that begin with `AXON_` and are not settings, or `None` if there are none.
     pub fn unknown_variables(&self) -> Option<String> {
         let names = self.unknown_variables.iter().map(|name| name.escape_debug().to_string());
         let names = names.collect::<Vec<_>>().join(", ");
@@ -177,7 +178,8 @@ pub fn absolute_paths() -> Vec<(&'static str, Option<OsString>)> {
 
 const DAEMON_PATH: &str = "AXON_DAEMON_PATH";
 
-/// The environment, without what a program with more rights than its caller must not take from it.
+/// Returns the environment. In a program with more rights than its caller, removes or refuses the variables that it
+/// must not use.
 fn environment() -> Result<BTreeMap<OsString, OsString>, ConfigError> {
     let mut variables: BTreeMap<OsString, OsString> = std::env::vars_os().collect();
     if axon_shm::internal::is_elevated() {
@@ -186,8 +188,8 @@ fn environment() -> Result<BTreeMap<OsString, OsString>, ConfigError> {
     Ok(variables)
 }
 
-/// The `axon.toml` beside the daemon's program: the one that a setting names, else the one that a library
-/// knows of, else this very program.
+/// Returns the path of the `axon.toml` beside the daemon's program: the program that a setting names, otherwise the
+/// one that a library knows, otherwise this program.
 fn file_beside(named: Option<&Path>, known: Option<&Path>) -> Result<Option<PathBuf>, ConfigError> {
     let daemon = named.or(known).map(Path::to_path_buf).or_else(|| std::env::current_exe().ok());
     let file = daemon.map(|daemon| daemon.with_file_name("axon.toml"));

@@ -7,73 +7,74 @@ use minicbor::{Decode, Encode};
 use super::{TopicPriority, TopicRule, daemon_env::DaemonEnv, topics};
 use crate::access::{AccessRules, RateLimit};
 
-/// Everything that the environment and `axon.toml`, or a [`ConfigBuilder`](super::ConfigBuilder), decide.
+/// All settings that the environment and `axon.toml`, or a [`ConfigBuilder`](super::ConfigBuilder), determine.
 ///
-/// To change one, change the builder: neither validation nor the daemon that a session starts knows of a
-/// field that was assigned to.
+/// To change a setting, use the builder. A value that is assigned to a field is not validated, and does not reach the
+/// daemon that a session starts.
 #[derive(Clone, Debug)]
 #[non_exhaustive]
 pub struct Config {
-    /// How peers prove themselves and agree on keys.
+    /// Authentication of peers and key agreement.
     pub security: Security,
-    /// The one cipher offered (`AXON_QUIC_CIPHER`).
+    /// The only cipher that is offered (`AXON_QUIC_CIPHER`).
     pub cipher: QuicCipher,
-    /// `ROS_DOMAIN_ID`.
+    /// The ROS domain (`ROS_DOMAIN_ID`).
     pub domain: u32,
-    /// How far a session is discovered (`ROS_AUTOMATIC_DISCOVERY_RANGE`, `ROS_LOCALHOST_ONLY`). Of a
-    /// daemon it counts while the daemon has no session.
+    /// Discovery range of a session (`ROS_AUTOMATIC_DISCOVERY_RANGE`, `ROS_LOCALHOST_ONLY`). A daemon uses its own
+    /// range only while it has no session.
     pub range: DiscoveryRange,
-    /// `ROS_STATIC_PEERS`: addresses or host names; empty where the range ignores them.
+    /// Addresses or host names of static peers (`ROS_STATIC_PEERS`). Empty if the range ignores them.
     pub static_peers: Vec<String>,
-    /// `AXON_DAEMON`.
+    /// Use of a daemon (`AXON_DAEMON`).
     pub daemon: DaemonPolicy,
-    /// `AXON_DAEMON_PATH`.
+    /// The daemon's program (`AXON_DAEMON_PATH`).
     pub daemon_path: Option<PathBuf>,
-    /// Where a daemon keeps files: `AXON_RUNTIME_DIR`, else `$XDG_RUNTIME_DIR/axon`, else nowhere.
+    /// Directory for the daemon's files: `AXON_RUNTIME_DIR`, otherwise `$XDG_RUNTIME_DIR/axon`. `None` if neither is
+    /// set.
     pub runtime_dir: Option<PathBuf>,
-    /// Whether `AXON_RUNTIME_DIR` was set: then it holds the session socket too.
+    /// True if `AXON_RUNTIME_DIR` was set. The directory then also holds the session socket.
     pub socket_in_runtime_dir: bool,
-    /// `AXON_BIND_ADDRS`; empty means every address.
+    /// Local addresses of discovery and links (`AXON_BIND_ADDRS`). Empty means every address.
     pub bind_addrs: Vec<IpAddr>,
-    /// `AXON_DAEMON_PEERS`.
+    /// Peers to try besides those that discovery finds (`AXON_DAEMON_PEERS`).
     pub daemon_peers: Vec<PeerAddress>,
-    /// `AXON_ADVERTISE_ADDRS`; empty means the interfaces' addresses.
+    /// Addresses in beacons (`AXON_ADVERTISE_ADDRS`). Empty means the addresses of the interfaces.
     pub advertise_addrs: Vec<IpAddr>,
-    /// `AXON_RING_BUFFER_SIZE_MB` in bytes: history per ring.
+    /// Size of the history per ring, in bytes (`AXON_RING_BUFFER_SIZE_MB`).
     pub ring_bytes: u64,
-    /// `AXON_MAX_MESSAGE_MB` in bytes: the largest message.
+    /// Size of the largest message, in bytes (`AXON_MAX_MESSAGE_MB`).
     pub max_message: u64,
-    /// `AXON_RELIABLE_QUEUE_MB` in bytes: the daemon's reliable queue.
+    /// Size of the daemon's reliable queue, in bytes (`AXON_RELIABLE_QUEUE_MB`).
     pub reliable_queue: u64,
-    /// `AXON_SHM`: whether sessions share memory; their samples pass through the daemon otherwise.
+    /// True if sessions share memory (`AXON_SHM`). Otherwise, their samples pass through the daemon.
     pub shm: bool,
-    /// `AXON_SHM_COPY`.
+    /// True if samples of more than 4 KiB are copied when they are taken (`AXON_SHM_COPY`).
     pub shm_copy: bool,
-    /// `AXON_TRUSTED_UIDS`.
+    /// Users, besides the own one, whose daemon and sessions are trusted (`AXON_TRUSTED_UIDS`).
     pub trusted_uids: Vec<u32>,
-    /// `AXON_LOG`: a tracing filter.
+    /// Log filter in the syntax of `tracing` (`AXON_LOG`).
     pub log: String,
-    /// Who may do what: the rules of `AXON_ACCESS_FILE`, or those of `axon.toml`.
+    /// Access rules of `AXON_ACCESS_FILE` or `axon.toml`.
     pub access: AccessRules,
-    /// Where those rules are; `None` where there are none.
+    /// The file of the access rules. `None` without rules.
     pub access_file: Option<PathBuf>,
-    /// `[link]` of `axon.toml`.
+    /// The section `[link]` of `axon.toml`.
     pub link: LinkConfig,
-    /// `[[topic]]` of `axon.toml`. The first entry that a name fits counts.
+    /// The entries `[[topic]]` of `axon.toml`. The first entry that fits a name applies.
     pub topics: Vec<TopicRule>,
-    /// Variables of the environment that begin with `AXON_` and are no settings. They count for nothing.
+    /// Environment variables that begin with `AXON_` and are not settings. AXON ignores them.
     pub unknown_variables: Vec<String>,
-    /// How a daemon that a session starts comes to these settings.
+    /// Environment that passes these settings to a daemon which a session starts.
     pub(crate) daemon_env: DaemonEnv,
 }
 
 impl Config {
-    /// The priority of a topic or service between hosts, by its name.
+    /// Returns the priority of a topic or service between hosts, by its name.
     pub fn topic_priority(&self, name: &str) -> TopicPriority {
         topics::first(&self.topics, name).map_or(TopicPriority::Normal, |rule| rule.priority)
     }
 
-    /// Whether the samples of a topic or service may be compressed for other hosts.
+    /// Returns whether the daemon may compress the samples of a topic or service for other hosts.
     pub fn topic_compression(&self, name: &str) -> bool {
         let of_topic = topics::first(&self.topics, name).map(|rule| rule.compression);
         [Some(self.link.compression), of_topic]
@@ -81,23 +82,23 @@ impl Config {
             .all(|one| *one != Some(LinkCompression::Never))
     }
 
-    /// The limit that `max_hz` sets for the samples of a topic to each other host.
+    /// Returns the limit that `max_hz` sets for the samples of a topic to each other host.
     pub fn topic_limit(&self, name: &str) -> Option<RateLimit> {
         topics::first(&self.topics, name)?.limit()
     }
 }
 
-/// The choice that [`Security`] holds the settings of (`AXON_SECURITY_MODE`).
+/// The security mode (`AXON_SECURITY_MODE`). [`Security`] holds its settings.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SecurityMode {
-    /// X25519MLKEM768 and nothing else.
+    /// Keys from X25519MLKEM768 alone.
     Classic,
     /// A KME key as external PSK.
     Qkd,
 }
 
 impl SecurityMode {
-    /// As `AXON_SECURITY_MODE` spells it.
+    /// Returns the value of `AXON_SECURITY_MODE`.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Classic => "classic",
@@ -106,10 +107,10 @@ impl SecurityMode {
     }
 }
 
-/// How peers prove themselves and agree on keys (`AXON_SECURITY_MODE`).
+/// Authentication of peers and key agreement (`AXON_SECURITY_MODE`).
 #[derive(Clone, Debug)]
 pub enum Security {
-    /// X25519MLKEM768 and nothing else.
+    /// Keys from X25519MLKEM768 alone.
     Classic(ClassicConfig),
     /// A KME key as external PSK.
     Qkd(QkdConfig),
@@ -119,35 +120,35 @@ pub enum Security {
 #[derive(Clone, Debug)]
 #[non_exhaustive]
 pub struct ClassicConfig {
-    /// `AXON_CLASSIC_AUTH`.
+    /// Authentication of peers (`AXON_CLASSIC_AUTH`).
     pub auth: ClassicAuth,
-    /// `AXON_CLASSIC_KEY`: PKCS#8, mode 0600.
+    /// File of this host's private key, PKCS#8, mode 0600 or 0400 (`AXON_CLASSIC_KEY`).
     pub key: Option<PathBuf>,
-    /// `AXON_CLASSIC_TRUST`: the pins.
+    /// File of pins (`AXON_CLASSIC_TRUST`).
     pub trust: Option<PathBuf>,
-    /// `AXON_CLASSIC_CA`.
+    /// File of roots (`AXON_CLASSIC_CA`).
     pub ca: Option<PathBuf>,
-    /// `AXON_CLASSIC_CERT`.
+    /// File of this host's certificate chain (`AXON_CLASSIC_CERT`).
     pub cert: Option<PathBuf>,
-    /// `AXON_CLASSIC_CRL`.
+    /// File of certificate revocation lists (`AXON_CLASSIC_CRL`).
     pub crl: Option<PathBuf>,
 }
 
 impl ClassicConfig {
-    /// These settings, without any file.
+    /// Creates settings without files.
     pub fn new(auth: ClassicAuth) -> Self {
         Self { auth, key: None, trust: None, ca: None, cert: None, crl: None }
     }
 }
 
-/// How a peer is known in `classic`.
+/// Authentication of a peer in `classic`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ClassicAuth {
-    /// Not at all: stops a recording adversary, not an active one.
+    /// No authentication. Protects against eavesdroppers, not against an active attacker.
     None,
     /// Raw public keys listed in a trust file.
     Pinned,
-    /// Certificates under given roots.
+    /// Certificates that chain to the given roots.
     Ca,
 }
 
@@ -155,36 +156,37 @@ pub enum ClassicAuth {
 #[derive(Clone, Debug)]
 #[non_exhaustive]
 pub struct QkdConfig {
-    /// `AXON_QKD_KEY_MODE`.
+    /// Scope of KME keys (`AXON_QKD_KEY_MODE`).
     pub key_mode: KeyMode,
-    /// `AXON_QKD_KEX`.
+    /// Key exchange beside the KME key (`AXON_QKD_KEX`).
     pub kex: QkdKex,
-    /// `AXON_QKD_PEERS`.
+    /// SAEs that may be peers (`AXON_QKD_PEERS`).
     pub peers: QkdPeers,
-    /// `AXON_QKD_SESSION_MAX_AGE`.
+    /// Age at which a connection is replaced by one under a new key (`AXON_QKD_SESSION_MAX_AGE`).
     pub session_max_age: Duration,
-    /// `AXON_KME_URL`.
+    /// URL of this host's KME (`AXON_KME_URL`).
     pub kme_url: String,
-    /// `AXON_KME_CA`.
+    /// File of roots for the KME's certificate (`AXON_KME_CA`).
     pub kme_ca: PathBuf,
-    /// `AXON_KME_ID`.
+    /// Common name that the KME's certificate must also have (`AXON_KME_ID`). `None` disables the check.
     pub kme_id: Option<String>,
-    /// `AXON_SAE_ID`.
+    /// This host's SAE ID (`AXON_SAE_ID`).
     pub sae_id: String,
-    /// `AXON_SAE_CERT`.
+    /// File of the client certificate for the KME (`AXON_SAE_CERT`).
     pub sae_cert: PathBuf,
-    /// `AXON_SAE_KEY`.
+    /// File of the client certificate's private key, mode 0600 or 0400 (`AXON_SAE_KEY`).
     pub sae_key: PathBuf,
-    /// `AXON_KME_QUIRKS`.
+    /// Tolerated deviations of the KME, by the names of [`KME_QUIRKS`](Self::KME_QUIRKS) (`AXON_KME_QUIRKS`).
     pub kme_quirks: Vec<String>,
-    /// `AXON_KME_CONNECT_TIMEOUT`: how long TCP and TLS to the KME may take.
+    /// Maximum time for TCP and TLS to the KME (`AXON_KME_CONNECT_TIMEOUT`).
     pub kme_connect_timeout: Duration,
-    /// `AXON_KME_ANSWER_TIMEOUT`: how long a whole call may take.
+    /// Maximum time for a whole call to the KME (`AXON_KME_ANSWER_TIMEOUT`).
     pub kme_answer_timeout: Duration,
 }
 
 impl QkdConfig {
-    /// Settings with a default for each that is not given here. Only [`Config::builder`] checks them.
+    /// Creates settings with defaults for all values that are not given here. Only [`Config::builder`] validates
+    /// settings.
     pub fn new(
         sae_id: impl Into<String>,
         peers: QkdPeers,
@@ -210,12 +212,12 @@ impl QkdConfig {
         }
     }
 
-    /// The quirk of a KME whose certificate does not name the host in its URL, as one without a
-    /// subjectAltName: the host's name is not checked, and [`kme_id`](Self::kme_id) alone tells the KME
-    /// from other holders of a certificate from [`kme_ca`](Self::kme_ca). Not valid without that ID.
+    /// Quirk of a KME whose certificate does not name the host in the KME's URL, for example because it has no
+    /// subjectAltName. The client then does not check the host name. Only [`kme_id`](Self::kme_id) distinguishes the
+    /// KME from other holders of a certificate from [`kme_ca`](Self::kme_ca). Not valid without `kme_id`.
     pub const NO_NAME_CHECK: &'static str = "no-name-check";
 
-    /// The quirks that [`kme_quirks`](Self::kme_quirks) may name: those of `etsi-qkd014`, and
+    /// Quirks that [`kme_quirks`](Self::kme_quirks) may name: the quirks of `etsi-qkd014`, and
     /// [`NO_NAME_CHECK`](Self::NO_NAME_CHECK).
     pub const KME_QUIRKS: [&'static str; 10] = [
         "any-key-id",
@@ -230,7 +232,7 @@ impl QkdConfig {
         Self::NO_NAME_CHECK,
     ];
 
-    /// Whether the KME's certificate must name the host in the KME's URL.
+    /// Returns whether the KME's certificate must name the host in the KME's URL.
     pub fn checks_name(&self) -> bool {
         !self.kme_quirks.iter().any(|quirk| quirk == Self::NO_NAME_CHECK)
     }
@@ -247,7 +249,7 @@ pub enum QuicCipher {
 }
 
 impl QuicCipher {
-    /// As `AXON_QUIC_CIPHER` spells it.
+    /// Returns the value of `AXON_QUIC_CIPHER`.
     pub const fn name(self) -> &'static str {
         match self {
             Self::ChaCha20Poly1305 => "chacha20-poly1305",
@@ -256,10 +258,10 @@ impl QuicCipher {
     }
 }
 
-/// How a KME key is used as a pre-shared key (`AXON_QKD_KEX`; RFC 8446 section 4.2.9).
+/// Use of a KME key as a pre-shared key (`AXON_QKD_KEX`; RFC 8446 section 4.2.9).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum QkdKex {
-    /// The key alone. No forward secrecy: who learns the key later reads a recorded connection.
+    /// The key alone. No forward secrecy: an attacker who learns the key later can decrypt a recorded connection.
     #[default]
     PskKe,
     /// The key together with X25519MLKEM768.
@@ -267,7 +269,7 @@ pub enum QkdKex {
 }
 
 impl QkdKex {
-    /// As `AXON_QKD_KEX` spells it.
+    /// Returns the value of `AXON_QKD_KEX`.
     pub const fn name(self) -> &'static str {
         match self {
             Self::PskKe => "psk_ke",
@@ -276,26 +278,26 @@ impl QkdKex {
     }
 }
 
-/// What KME keys protect (`AXON_QKD_KEY_MODE`).
+/// Scope of KME keys (`AXON_QKD_KEY_MODE`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum KeyMode {
     /// The QUIC session alone.
     Session,
-    /// The QUIC session, and each message in an envelope whose key changes every ten.
+    /// The QUIC session, and each message in an envelope whose key changes every ten messages.
     Messages10,
 }
 
-/// Which SAEs may be peers (`AXON_QKD_PEERS`).
+/// SAEs that may be peers (`AXON_QKD_PEERS`).
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum QkdPeers {
     /// Any SAE that the KME knows; written `*`.
     Any,
-    /// These.
+    /// The listed SAE IDs.
     Listed(Vec<String>),
 }
 
 impl QkdPeers {
-    /// Whether `sae` may be a peer.
+    /// Returns whether `sae` may be a peer.
     pub fn allows(&self, sae: &str) -> bool {
         match self {
             Self::Any => true,
@@ -304,34 +306,34 @@ impl QkdPeers {
     }
 }
 
-/// What a session does about its daemon (`AXON_DAEMON`).
+/// Use of a daemon by a session (`AXON_DAEMON`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum DaemonPolicy {
-    /// Start one when there is none.
+    /// Start a daemon if none runs.
     Spawn,
-    /// Fail when there is none.
+    /// Fail if no daemon runs.
     Require,
-    /// Never use one: only what this process reaches by itself.
+    /// Never use a daemon. The session then reaches only its own process.
     Off,
 }
 
-/// How far a session is discovered, as ROS 2 means it; the narrowest first.
+/// Discovery range of a session, as ROS 2 defines it. The order begins with the narrowest range.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Encode, Decode)]
 #[cbor(index_only)]
 pub enum DiscoveryRange {
-    /// Nowhere: the session matches nothing but itself.
+    /// The session matches only its own endpoints.
     #[n(2)]
     Off,
-    /// This host, and hosts of which either side lists the other as a static peer.
+    /// This host, and other hosts if either side lists the other as a static peer.
     #[n(1)]
     Localhost,
-    /// What multicast reaches, and static peers.
+    /// Hosts that multicast reaches, and static peers.
     #[n(0)]
     Subnet,
 }
 
 impl DaemonPolicy {
-    /// As `AXON_DAEMON` spells it.
+    /// Returns the value of `AXON_DAEMON`.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Spawn => "spawn",
@@ -342,7 +344,7 @@ impl DaemonPolicy {
 }
 
 impl DiscoveryRange {
-    /// Its number on every wire.
+    /// Returns the number in the wire formats.
     pub const fn number(self) -> u8 {
         match self {
             Self::Subnet => 0,
@@ -351,7 +353,7 @@ impl DiscoveryRange {
         }
     }
 
-    /// The value of `ROS_AUTOMATIC_DISCOVERY_RANGE`.
+    /// Returns the value of `ROS_AUTOMATIC_DISCOVERY_RANGE`.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Off => "OFF",
@@ -365,70 +367,71 @@ impl DiscoveryRange {
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct PeerAddress {
-    /// Address or name.
+    /// Address or host name.
     pub host: String,
-    /// The QUIC port; all sixteen of the domain are tried when absent.
+    /// The QUIC port. `None` means that the daemon tries all sixteen ports of the domain.
     pub port: Option<u16>,
 }
 
-/// `[link]` of `axon.toml`.
+/// The section `[link]` of `axon.toml`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct LinkConfig {
-    /// How long a daemon outlives its last session.
+    /// Time for which a daemon outlives its last session.
     pub grace: Duration,
-    /// A peer that reads nothing of a KEEP_ALL topic for so long is disconnected from it.
+    /// Time after which a peer that reads nothing of a KEEP_ALL topic is disconnected from it.
     pub stalled: Duration,
     /// Largest UDP payload that path discovery tries, in bytes.
     pub mtu: u16,
-    /// Memory for the graph of one peer, in bytes. Its routes may take four times as much.
+    /// Memory for the graph of one peer, in bytes. The peer's routes may take four times as much.
     pub graph: usize,
-    /// Memory for the samples and calls of one peer that are kept here for readers and servers, in bytes.
+    /// Memory for one peer's samples and calls that this host keeps for its readers and servers, in bytes.
     pub held: u64,
-    /// How long the reactor looks for input before it sleeps.
+    /// Polling of the reactor before it sleeps.
     pub poll: LinkPoll,
-    /// Where QUIC's events are written, in the format qlog.
+    /// Directory for QUIC's events in the format qlog.
     pub qlog: Option<PathBuf>,
-    /// How a link finds its share of the path.
+    /// Congestion controller of links.
     pub congestion: Congestion,
-    /// Whether samples are compressed.
+    /// Compression of samples for other hosts.
     pub compression: LinkCompression,
 }
 
-/// Whether the daemon looks for the next input before it sleeps (`AXON_LINK_POLL`).
+/// Polling of the daemon for the next input before it sleeps (`AXON_LINK_POLL`).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum LinkPoll {
-    /// For some tens of microseconds, while that often finds an input.
+    /// Spins for tens of microseconds while this often finds an input.
     #[default]
     Adaptive,
-    /// It never sleeps, and keeps a processor busy.
+    /// Never sleeps, and keeps one processor busy.
     Always,
-    /// It sleeps at once.
+    /// Sleeps at once.
     Never,
 }
 
-/// The congestion controller of links (`AXON_LINK_CONGESTION`). Either side of a link decides for what it sends.
+/// The congestion controller of links (`AXON_LINK_CONGESTION`). Each side of a link selects the controller of its
+/// output.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Congestion {
     /// `Delay` to private and link-local addresses, `Cubic` to all others.
     #[default]
     Auto,
-    /// AXON's own: it keeps queues short and ignores random loss, as radio links need it.
+    /// AXON's own controller. It keeps queues short and ignores random loss, as radio links require.
     Delay,
     /// CUBIC (RFC 9438), which most of the Internet uses.
     Cubic,
-    /// BBR, as the QUIC library has it.
+    /// BBR, as the QUIC library implements it.
     Bbr,
 }
 
-/// Whether samples are compressed for other hosts (`AXON_LINK_COMPRESSION`). A daemon decides for what it sends.
+/// Compression of samples for other hosts (`AXON_LINK_COMPRESSION`). Each daemon decides for its own output.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum LinkCompression {
-    /// Those of 1 KiB to 8 MiB by zstd, while the link carries less than waits for it and compression takes at most 0.3 of
-    /// the time for which the link is busy with the sample.
+    /// Compresses samples of 1 KiB to 8 MiB with zstd while the link is the bottleneck and compression takes at most
+    /// 0.3 of the sample's sending time.
     #[default]
     Auto,
-    /// None.
+    /// Compresses no samples.
     Never,
 }
 

@@ -2,7 +2,7 @@
 
 use super::ConfigError;
 
-/// Every `AXON_` setting that `axon.toml` may hold too, there in lower case without the prefix.
+/// `AXON_` settings that `axon.toml` may also hold, there in lower case and without the prefix.
 pub(super) const SETTINGS: &[&str] = &[
     "AXON_SECURITY_MODE",
     "AXON_QKD_KEY_MODE",
@@ -41,7 +41,7 @@ pub(super) const SETTINGS: &[&str] = &[
     "AXON_LOG",
 ];
 
-/// What `[link]` of `axon.toml` holds, as variables: there `AXON_LINK_MTU` is `mtu`.
+/// Settings of `[link]` in `axon.toml`, as variables. `AXON_LINK_MTU` is `mtu` there.
 pub(super) const LINK: &[&str] = &[
     "AXON_LINK_GRACE_S",
     "AXON_LINK_STALLED_S",
@@ -54,7 +54,7 @@ pub(super) const LINK: &[&str] = &[
     "AXON_LINK_COMPRESSION",
 ];
 
-/// Settings that name files. A relative one is another file for a process in another directory.
+/// Settings that name files. A relative path depends on the current directory of the process.
 pub(super) const PATHS: &[&str] = &[
     CONFIG,
     "AXON_DAEMON_PATH",
@@ -69,22 +69,22 @@ pub(super) const PATHS: &[&str] = &[
     ACCESS_FILE,
 ];
 
-/// Where a daemon keeps files, always an absolute path.
+/// Directory for the daemon's files, always an absolute path.
 pub(super) const RUNTIME_DIR: &str = "AXON_RUNTIME_DIR";
 
-/// Where the daemon writes QUIC's events, always an absolute path.
+/// Directory to which the daemon writes QUIC's events, always an absolute path.
 pub(super) const QLOG: &str = "AXON_LINK_QLOG";
 
 /// A file of access rules.
 pub(super) const ACCESS_FILE: &str = "AXON_ACCESS_FILE";
 
-/// Users who are let in.
+/// Trusted users.
 pub(super) const TRUSTED_UIDS: &str = "AXON_TRUSTED_UIDS";
 
-/// Where `axon.toml` is; the one setting that the file cannot hold.
+/// The path of `axon.toml`. The file itself cannot hold this setting.
 pub(super) const CONFIG: &str = "AXON_CONFIG";
 
-/// Settings that mean something in `qkd` only.
+/// Settings that are valid in `qkd` only.
 pub(super) const QKD_ONLY: &[&str] = &[
     "AXON_QKD_KEY_MODE",
     "AXON_QKD_KEX",
@@ -101,7 +101,7 @@ pub(super) const QKD_ONLY: &[&str] = &[
     "AXON_SAE_KEY",
 ];
 
-/// Settings that mean something in `classic` only.
+/// Settings that are valid in `classic` only.
 pub(super) const CLASSIC_ONLY: &[&str] = &[
     "AXON_CLASSIC_AUTH",
     "AXON_CLASSIC_KEY",
@@ -111,7 +111,7 @@ pub(super) const CLASSIC_ONLY: &[&str] = &[
     "AXON_CLASSIC_CRL",
 ];
 
-/// Settings that once were, with what takes their place.
+/// Obsolete settings and their replacements.
 const OBSOLETE: &[(&str, &str)] = &[
     (
         "AXON_SECURITY_PROFILE",
@@ -130,10 +130,11 @@ const OBSOLETE: &[(&str, &str)] = &[
     ),
 ];
 
-/// In the environment only: `1` refuses every variable that begins with `AXON_` and is no setting.
+/// A variable of the environment only. `1` refuses every variable that begins with `AXON_` and is not a
+/// setting.
 pub(super) const STRICT: &str = "AXON_STRICT_ENV";
 
-/// Words of settings that decide about security: a name with one of them is never somebody else's.
+/// Words of security settings. A variable whose name contains one is never taken for another program's.
 const SECURITY_WORDS: &[&str] = &[
     "AUTH",
     "AUTHENTICATION",
@@ -171,8 +172,9 @@ const SECURITY_WORDS: &[&str] = &[
     "VERIFY",
 ];
 
-/// Whether `name` of the environment, which is no setting, was meant to be one: it is close to one that is
-/// or was, its first word is one of theirs, or any of its words speaks of security.
+/// Returns whether the environment variable `name`, which is not a setting, was meant to be one. It was if
+/// it is close to a current or obsolete setting, shares its first word with one, or contains a word about
+/// security.
 pub(super) fn resembles(name: &str) -> bool {
     let upper = name.to_ascii_uppercase();
     let words = || upper.split('_').skip(1);
@@ -190,14 +192,14 @@ pub(super) fn resembles(name: &str) -> bool {
         || words().any(is_word)
 }
 
-/// The setting called `name`, or why there is none.
+/// Returns the setting called `name`, or the error for an unknown or obsolete name.
 pub(super) fn setting(name: &str) -> Result<&'static str, ConfigError> {
     if let Some(known) = SETTINGS.iter().chain(LINK).chain([&CONFIG]).find(|known| **known == name)
     {
         return Ok(known);
     }
     if let Some((_, instead)) = obsolete(name) {
-        // Its value may be a key.
+        // The value may be a key.
         return Err(ConfigError::withheld(name, *instead));
     }
     let close = nearest_name(name, SETTINGS.iter().chain(LINK).copied().chain([CONFIG, STRICT]));
@@ -208,7 +210,7 @@ pub(super) fn setting(name: &str) -> Result<&'static str, ConfigError> {
     Err(ConfigError::name(name, accepted))
 }
 
-/// Whether `name` once was a setting.
+/// Returns whether `name` is an obsolete setting.
 pub(super) fn is_obsolete(name: &str) -> bool {
     obsolete(name).is_some()
 }
@@ -217,8 +219,8 @@ fn obsolete(name: &str) -> Option<&'static (&'static str, &'static str)> {
     OBSOLETE.iter().find(|(old, _)| *old == name)
 }
 
-/// The name that `name` most likely meant, if any is close: by what follows `AXON_`, which all share, so
-/// that no short name is close to every other.
+/// Returns the name that `name` most likely meant, if any is close. Compares only the parts after `AXON_`:
+/// with the common prefix, each short name would be close to every other.
 fn nearest_name<'a>(name: &str, names: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
     let own = |name: &'a str| name.strip_prefix("AXON_").unwrap_or(name);
     let meant = name.strip_prefix("AXON_").unwrap_or(name);
@@ -227,12 +229,12 @@ fn nearest_name<'a>(name: &str, names: impl IntoIterator<Item = &'a str>) -> Opt
     names.into_iter().find(|name| own(name) == close)
 }
 
-/// The candidate that `text` most likely meant, if any is close.
+/// Returns the candidate that `text` most likely meant, if any is close.
 pub(super) fn nearest<'a>(
     text: &str,
     candidates: impl IntoIterator<Item = &'a str>,
 ) -> Option<&'a str> {
-    // Far longer than any name: nothing is close, and the distance would cost time.
+    // The text is longer than any name: no name is close, and computing the distance would cost time.
     if text.len() > 64 {
         return None;
     }
@@ -244,7 +246,7 @@ pub(super) fn nearest<'a>(
         .map(|(_, candidate)| candidate)
 }
 
-/// Edits (insert, delete, replace a byte) from one text to the other.
+/// Returns the number of edits (insert, delete or replace a byte) from one text to the other.
 fn distance(a: &str, b: &str) -> usize {
     let mut row: Vec<usize> = (0..=b.len()).collect();
     for (i, x) in a.bytes().enumerate() {

@@ -1,4 +1,4 @@
-//! Checks which settings may be combined, and fills in the defaults.
+//! Checks which settings may be combined, and sets the defaults.
 
 use std::{
     ffi::OsString,
@@ -18,9 +18,9 @@ use super::{
 };
 
 const MIB: u64 = 1 << 20;
-/// Longest path of a unix socket on Linux, in bytes, without the closing zero.
+/// Longest path of a Unix socket on Linux, in bytes, without the terminating zero.
 const LONGEST_SOCKET_PATH: usize = 107;
-/// As many static peers as rcl takes.
+/// Maximum number of static peers, as in rcl.
 const MOST_ROS_PEERS: usize = 32;
 
 pub(super) fn resolve(
@@ -70,7 +70,7 @@ pub(super) fn resolve(
 
     let bind_addrs = values.addresses("AXON_BIND_ADDRS", 16)?;
     if values.is_set("AXON_BIND_ADDRS") && bind_addrs.is_empty() {
-        // Nothing must not come to mean everything.
+        // An empty list must not mean all addresses.
         return Err(values.refuse("AXON_BIND_ADDRS", "local addresses; unset it for all of them"));
     }
     Ok(Config {
@@ -87,7 +87,7 @@ pub(super) fn resolve(
         daemon_peers: values.peer_addresses("AXON_DAEMON_PEERS")?,
         advertise_addrs: values.addresses("AXON_ADVERTISE_ADDRS", 4)?,
         ring_bytes: megabytes("AXON_RING_BUFFER_SIZE_MB", 65_536, 64)?,
-        // The length of a message is a u32 on every wire.
+        // Every wire format has a u32 for the length of a message.
         max_message: megabytes("AXON_MAX_MESSAGE_MB", 4_095, 256)?,
         reliable_queue: megabytes("AXON_RELIABLE_QUEUE_MB", 65_536, 256)?,
         shm: values.choice("AXON_SHM", &[("on", true), ("off", false)])?.unwrap_or(true),
@@ -103,8 +103,8 @@ pub(super) fn resolve(
     })
 }
 
-/// A setting of the other mode would have no effect: the user who gave it expects a protection that
-/// is not there.
+/// Refuses settings of the other mode. They would have no effect, but the user expects a protection from
+/// them.
 fn refuse_all(
     values: &Values<'_, impl Files>,
     settings: &[&str],
@@ -229,13 +229,13 @@ fn qkd(values: &Values<'_, impl Files>) -> Result<QkdConfig, ConfigError> {
     })
 }
 
-/// How long a connection to the KME, and a whole call with it, may take.
+/// Returns the time limits for a connection to the KME and for a whole call.
 fn kme_timeouts(values: &Values<'_, impl Files>) -> Result<(Duration, Duration), ConfigError> {
     const CONNECT: &str = "AXON_KME_CONNECT_TIMEOUT";
     const ANSWER: &str = "AXON_KME_ANSWER_TIMEOUT";
     let connect = values.number(CONNECT, 1..=10, "seconds")?;
     let answer = values.number(ANSWER, 1..=10, "seconds")?.unwrap_or(3);
-    // A given answer time of 1 s is enough to say that connecting takes no longer.
+    // An answer timeout of 1 s also lowers the default of the connect timeout.
     let connect = connect.unwrap_or(answer.min(2));
     if connect > answer {
         let accepted = format!(
@@ -258,7 +258,8 @@ pub(super) fn domain(sources: &SettingSources) -> Result<u32, ConfigError> {
     }
 }
 
-/// ROS 2's discovery variables, by the rules of rcl: `ROS_LOCALHOST_ONLY=1` wins over the others.
+/// Returns ROS 2's discovery range and static peers, by the rules of rcl. `ROS_LOCALHOST_ONLY=1` wins over
+/// the other variables.
 fn range(sources: &SettingSources) -> Result<(DiscoveryRange, Vec<String>), ConfigError> {
     const RANGE: &str = "ROS_AUTOMATIC_DISCOVERY_RANGE";
     const PEERS: &str = "ROS_STATIC_PEERS";
@@ -297,7 +298,7 @@ pub(super) fn runtime_dir(
         }
         return Ok((Some(path), true));
     }
-    // The XDG specification has relative paths ignored.
+    // The XDG specification requires that relative paths are ignored.
     let xdg = values.sources.foreign.get("XDG_RUNTIME_DIR").map(Path::new);
     Ok((xdg.filter(|path| path.is_absolute()).map(|path| path.join("axon")), false))
 }
@@ -306,7 +307,7 @@ pub(super) fn runtime_dir(
 const POLL: [(&str, LinkPoll); 3] =
     [("adaptive", LinkPoll::Adaptive), ("always", LinkPoll::Always), ("never", LinkPoll::Never)];
 
-/// `qlog` of the section `[link]`.
+/// Parses `qlog` of the section `[link]`.
 fn qlog(
     name: &str,
     value: &toml::Value,
@@ -330,7 +331,7 @@ const CONGESTION: [(&str, Congestion); 4] = [
 pub(super) const COMPRESSION: [(&str, LinkCompression); 2] =
     [("auto", LinkCompression::Auto), ("never", LinkCompression::Never)];
 
-/// One of these words in the section `[link]`.
+/// Parses one of `words` in the section `[link]`.
 fn word<T: Copy>(
     name: &str,
     value: &toml::Value,

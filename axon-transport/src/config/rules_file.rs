@@ -1,5 +1,5 @@
-//! Files of access rules: the one that the settings name, the one that each daemon of a host obeys, and any other that
-//! somebody names.
+//! Files of access rules: the file that the settings name, the file of the host, and any other file that a caller
+//! names.
 
 use std::{
     io::ErrorKind,
@@ -15,16 +15,16 @@ use super::{
 };
 use crate::access::{AccessError, AccessRules, HostPattern};
 
-/// The access rules of a host. A daemon whose settings name no rules has these.
+/// The access rules of the host. A daemon uses them if its settings name no rules.
 const OF_HOST: &str = "/etc/axon/access.toml";
-/// What `AXON_ACCESS_FILE` names to have no rules, not those of the host either.
+/// The value of `AXON_ACCESS_FILE` for no rules, not even those of the host.
 const NO_FILE: &str = "/dev/null";
 
-/// The rules of a file. One that has a setting is read as settings with rules among them, which `AXON_CONFIG` may
-/// name; any other as `AXON_ACCESS_FILE` is.
+/// Parses the rules of a file. A file with a setting is parsed as an `axon.toml` with rules, as `AXON_CONFIG` may
+/// name it. Any other file is parsed like the file of `AXON_ACCESS_FILE`.
 ///
 /// # Errors
-/// The first thing that is wrong with a rule. The settings are not looked at.
+/// The first fault of a rule. The settings are not checked.
 pub fn parse(text: &str, file: &str) -> Result<AccessRules, AccessError> {
     let table = text.parse::<toml::Table>();
     if table.is_ok_and(|table| table.keys().any(|key| is_setting_key(key))) {
@@ -33,7 +33,7 @@ pub fn parse(text: &str, file: &str) -> Result<AccessRules, AccessError> {
     AccessRules::parse(text, file)
 }
 
-/// The rules that the settings name, and the file that they are in.
+/// Returns the rules that the settings name, and the file that contains them.
 pub(super) fn of_settings(
     values: &Values<'_, impl Files>,
     security: &Security,
@@ -61,13 +61,14 @@ pub(super) fn of_settings(
 }
 
 impl Config {
-    /// Takes the access rules of this host, `/etc/axon/access.toml`, where the settings name none and there is such a
-    /// file. A daemon does so before it starts: a session may have started it whose environment names no rules.
-    ///
-    /// # Errors
-    /// A file that cannot be read or used. It never counts as no rules.
+    /// Takes the access rules of this host, `/etc/axon/access.toml`, if the settings name no rules and the file
+    /// exists. A daemon calls this before it starts, because the environment of the session that started it may name
+    /// no rules.
     ///
     /// For this project's crates.
+    ///
+    /// # Errors
+    /// The file cannot be read or used. Such a file never counts as no rules.
     #[doc(hidden)]
     pub fn with_rules_of_host(self) -> Result<Self, ConfigError> {
         self.with_rules_of(Path::new(OF_HOST), &OsFiles)
@@ -87,7 +88,7 @@ impl Config {
         };
         let facts = match files.facts(path) {
             Ok(facts) => facts,
-            // Only a file that is certainly not there is no file.
+            // Only a file that certainly does not exist counts as absent.
             Err(error) if error.kind() == ErrorKind::NotFound => return Ok(self),
             Err(error) => return Err(wrong(format!("a file that can be read ({error})"))),
         };
@@ -104,7 +105,7 @@ impl Config {
     }
 }
 
-/// The rules in a file that has nothing else.
+/// Reads a file that contains only rules.
 fn read(path: &Path, files: &impl Files) -> Result<AccessRules, ConfigError> {
     const NAME: &str = names::ACCESS_FILE;
     let shown = path.to_string_lossy();
@@ -117,7 +118,7 @@ fn read(path: &Path, files: &impl Files) -> Result<AccessRules, ConfigError> {
     rules.map_err(|error| ConfigError::rules(NAME, &error).at(&*shown))
 }
 
-/// Refuses a rule that fits nobody in this mode: it would protect nothing.
+/// Refuses a rule that no peer can match in this mode, because it would protect nothing.
 fn check_parties(rules: &AccessRules, file: &Path, security: &Security) -> Result<(), ConfigError> {
     let unnamed = matches!(security, Security::Classic(c) if c.auth == ClassicAuth::None);
     let dead = rules.hosts().find_map(|host| match host {
@@ -164,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn a_key_that_is_neither_rule_nor_setting_is_refused_where_there_are_rules_alone() {
+    fn unknown_key_in_a_rules_file_is_refused() {
         let error = parse(&format!("{RULES}[[alow]]\npeer = \"*\"\n"), "f").unwrap_err();
         assert!(error.what.contains("unknown key \"alow\""), "{error}");
         let among = format!("security_mode = \"classic\"\n{RULES}[[allow]]\npeer = 7\n");

@@ -1,4 +1,4 @@
-//! The two sources, environment and `axon.toml`, brought together under the settings' names.
+//! The two sources of settings, environment and `axon.toml`, merged under the settings' names.
 
 use std::{
     collections::BTreeMap,
@@ -14,7 +14,7 @@ use super::{
 };
 use crate::access::{AccessRules, parse::position};
 
-/// One setting as text, before anything is known about its value.
+/// One setting as text, before its value is checked.
 #[derive(Clone, Debug)]
 pub(super) struct Setting {
     pub(super) text: String,
@@ -29,32 +29,32 @@ pub(super) enum SettingOrigin {
     File(Rc<PathBuf>),
 }
 
-/// All settings given, and the few variables of others that count.
+/// All given settings, and the few variables of other programs that affect the configuration.
 #[derive(Debug, Default)]
 pub(super) struct SettingSources {
     pub(super) settings: BTreeMap<&'static str, Setting>,
     /// `ROS_*` and `XDG_RUNTIME_DIR`, from the environment alone.
     pub(super) foreign: BTreeMap<&'static str, String>,
-    /// Variables that begin with `AXON_` and are somebody else's.
+    /// Variables that begin with `AXON_` and belong to other programs.
     pub(super) strangers: Vec<String>,
-    /// `[qkd]` of the file, where there is one: settings that count once the mode is `qkd`.
+    /// The section `[qkd]` of the file, if present. Its settings apply once the mode is `qkd`.
     of_qkd: Option<BTreeMap<&'static str, Setting>>,
-    /// Settings that alone are looked at; all if there are none.
+    /// The only settings to read. `None` means all.
     only: Option<&'static [&'static str]>,
-    /// `[link]` of the file.
+    /// The section `[link]` of the file.
     pub(super) link: toml::Table,
-    /// `[[topic]]` of the file.
+    /// The entries `[[topic]]` of the file.
     pub(super) topics: Vec<TopicRule>,
     /// The access rules of the file.
     pub(super) access: AccessRules,
     pub(super) file: Option<Rc<PathBuf>>,
 }
 
-/// What a builder was given, as the environment would spell it; `None` where a variable of the
-/// environment is not to count.
+/// Values that a builder was given, spelled like environment variables. `None` hides a variable of the
+/// environment.
 pub(super) type Given = BTreeMap<&'static str, Option<String>>;
 
-/// Variables that are not ours but decide something.
+/// Variables of other programs that affect the configuration.
 pub(super) const FOREIGN: &[&str] = &[
     "ROS_DOMAIN_ID",
     "ROS_AUTOMATIC_DISCOVERY_RANGE",
@@ -64,9 +64,9 @@ pub(super) const FOREIGN: &[&str] = &[
 ];
 
 impl SettingSources {
-    /// Reads the environment, then the file it names (or `default_file`), and lets the environment
-    /// win. What a builder was `given` counts in place of the environment's. `default_file` may be
-    /// absent; one that `AXON_CONFIG` names may not.
+    /// Reads the environment, then the file that it names, or `default_file`. The environment wins over the
+    /// file. A builder's `given` values replace those of the environment. `default_file` may be absent; a
+    /// file that `AXON_CONFIG` names may not.
     pub(super) fn collect(
         env: impl IntoIterator<Item = (OsString, OsString)>,
         given: &Given,
@@ -88,7 +88,7 @@ impl SettingSources {
                     let read = path.to_string_lossy();
                     return Err(ConfigError::value(names::CONFIG, &read, "a regular file"));
                 }
-                // Only a file that is certainly not there is no file.
+                // Only a file that certainly does not exist counts as absent.
                 Some((_, Err(error))) if error.kind() == std::io::ErrorKind::NotFound => None,
                 Some((path, Err(error))) => return Err(unreadable(path, &error)),
                 None => None,
@@ -104,7 +104,7 @@ impl SettingSources {
         &mut self,
         env: impl IntoIterator<Item = (OsString, OsString)>,
     ) -> Result<(), ConfigError> {
-        // In order of name, so that of two defects it is always the same one that is named.
+        // Sorted by name, so that each run reports the same one of two defects.
         let mut ours: BTreeMap<OsString, OsString> = env
             .into_iter()
             .filter(|(name, _)| is_ours(name) || FOREIGN.iter().any(|f| name == f))
@@ -136,7 +136,8 @@ impl SettingSources {
         Ok(())
     }
 
-    /// The settings in `only`, whatever is wrong with others. A file that cannot be used counts as none.
+    /// Collects the settings in `only`, and ignores errors in others. A file that cannot be used counts as
+    /// absent.
     pub(super) fn collect_only(
         only: &'static [&'static str],
         env: impl IntoIterator<Item = (OsString, OsString)>,
@@ -250,12 +251,12 @@ impl SettingSources {
         Ok(())
     }
 
-    /// Whether the file has a section `[qkd]`.
+    /// Returns whether the file has a section `[qkd]`.
     pub(super) fn has_qkd(&self) -> bool {
         self.of_qkd.is_some()
     }
 
-    /// The mode is `qkd`: its section of the file counts, where the environment says nothing else.
+    /// Adds the settings of the file's section `[qkd]`, because the mode is `qkd`. Existing settings win.
     pub(super) fn enter_qkd(&mut self) {
         for (name, setting) in self.of_qkd.take().unwrap_or_default() {
             self.settings.entry(name).or_insert(setting);
@@ -263,7 +264,7 @@ impl SettingSources {
     }
 }
 
-/// Whether variables that are no settings are refused, whatever they resemble.
+/// Returns whether all unknown `AXON_` variables are refused, even those that resemble no setting.
 fn strict(text: &str) -> Result<bool, ConfigError> {
     match text {
         "0" => Ok(false),
@@ -272,7 +273,7 @@ fn strict(text: &str) -> Result<bool, ConfigError> {
     }
 }
 
-/// A key of the file, and its value as the environment would spell it.
+/// Returns the setting of a key in the file. The text is spelled like an environment variable.
 fn setting_of_file(
     key: &str,
     value: toml::Value,
@@ -284,7 +285,7 @@ fn setting_of_file(
     Ok((name, Setting { text, origin: SettingOrigin::File(Rc::clone(file)) }))
 }
 
-/// Whether a key at the top of a file is one of settings.
+/// Returns whether a top-level key of a file belongs to the settings.
 pub(super) fn is_setting_key(key: &str) -> bool {
     ["link", "qkd", "topic"].contains(&key) || setting_of_key(key).is_ok()
 }
@@ -307,7 +308,7 @@ fn named_file(text: &str, files: &impl Files) -> Result<PathBuf, ConfigError> {
     }
     let path = absolute(names::CONFIG, text, None, files)?;
     match files.facts(&path) {
-        // The usual way to say "no file", where one is installed.
+        // `/dev/null` is the usual way to disable an installed file.
         Ok(_) if path == Path::new("/dev/null") => Ok(path),
         Ok(facts) if facts.kind == FileKind::Regular => Ok(path),
         Ok(_) => Err(ConfigError::value(names::CONFIG, text, accepted)),
@@ -315,7 +316,8 @@ fn named_file(text: &str, files: &impl Files) -> Result<PathBuf, ConfigError> {
     }
 }
 
-/// `text` as an absolute path: relative to the file it stands in, else to the current directory.
+/// Returns `text` as an absolute path. A relative path is relative to the file that contains it, otherwise
+/// to the current directory.
 pub(super) fn absolute(
     name: &str,
     text: &str,
@@ -351,7 +353,7 @@ fn setting_of_key(key: &str) -> Result<&'static str, ConfigError> {
         let key = key.strip_prefix("link_").unwrap_or(key);
         return Err(ConfigError::name(&upper, format!("{key} in the section [link]")));
     }
-    // One spelling: `QKD_Peers` beside `qkd_peers` would be two keys of one setting.
+    // Only one spelling is valid: `QKD_Peers` beside `qkd_peers` would be two keys of one setting.
     if key.bytes().any(|byte| byte.is_ascii_uppercase()) {
         let key = key.strip_prefix("AXON_").unwrap_or(key).to_ascii_lowercase();
         return Err(ConfigError::name(&upper, format!("lower-case keys, here {key}")));
@@ -359,7 +361,7 @@ fn setting_of_key(key: &str) -> Result<&'static str, ConfigError> {
     names::setting(&upper)
 }
 
-/// A value of the file as the environment would spell it.
+/// Returns a value of the file, spelled like an environment variable.
 fn text_of(name: &str, value: toml::Value) -> Result<String, ConfigError> {
     match value {
         toml::Value::String(text) => Ok(text),

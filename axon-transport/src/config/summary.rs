@@ -6,12 +6,13 @@ use sha2::{Digest, Sha256};
 
 use super::{ClassicAuth, Config, ConfigError, Files, KeyMode, OsFiles, QkdPeers, Security};
 
-/// What a session tells its daemon about the security it was started with: each setting in force
-/// with its value, defaults included, in a fixed order.
+/// Returns the security settings that a session reports to its daemon: each setting in force with its
+/// value, including defaults, in a fixed order.
 ///
-/// Files appear as `sha256:` and the digest of their content, so that two paths to the same
-/// certificate agree and a changed file does not; private keys do not appear at all. Files are read
-/// anew at each call, which costs a few system calls and may fail when one has gone since.
+/// Certificates, pins and revocation lists appear as `sha256:` and the digest of their file. Two paths to
+/// the same certificate therefore agree, and a changed file does not. The access file appears as its path.
+/// Private keys do not appear. Each call reads the files again, which costs a few system calls, and fails
+/// if a file is gone.
 pub fn security_settings(config: &Config) -> Result<Vec<(String, String)>, ConfigError> {
     let mut settings = Settings(Vec::new());
     match &config.security {
@@ -38,7 +39,7 @@ pub fn security_settings(config: &Config) -> Result<Vec<(String, String)>, Confi
         }
     }
     settings.add("AXON_QUIC_CIPHER", config.cipher.name());
-    // Its content may change, and the daemon reads it again.
+    // The content may change: the daemon reads the file again.
     if let Some(file) = &config.access_file {
         settings.add("AXON_ACCESS_FILE", &file.to_string_lossy());
     }
@@ -68,7 +69,7 @@ impl Settings {
 }
 
 impl ClassicAuth {
-    /// As `AXON_CLASSIC_AUTH` spells it.
+    /// Returns the value of `AXON_CLASSIC_AUTH`.
     pub const fn name(self) -> &'static str {
         match self {
             Self::None => "none",
@@ -79,7 +80,7 @@ impl ClassicAuth {
 }
 
 impl KeyMode {
-    /// As `AXON_QKD_KEY_MODE` spells it.
+    /// Returns the value of `AXON_QKD_KEY_MODE`.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Session => "session",
@@ -89,7 +90,7 @@ impl KeyMode {
 }
 
 impl std::fmt::Display for QkdPeers {
-    /// As `AXON_QKD_PEERS` spells them, in alphabetical order.
+    /// Writes the value of `AXON_QKD_PEERS`, with the SAE IDs in alphabetical order.
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::Any => f.write_str("*"),

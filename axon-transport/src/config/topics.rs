@@ -1,42 +1,43 @@
-//! `[[topic]]` of `axon.toml`: what the daemon does for topics of some names.
+//! `[[topic]]` of `axon.toml`: settings of the daemon for topics by name.
 
 use super::{ConfigError, LinkCompression, resolve::COMPRESSION};
 use crate::access::{RateLimit, TopicPattern, parse::limit::rate};
 
-/// As many entries as a file may have. A topic is compared with each of them when it is matched.
+/// Maximum number of entries in a file. Matching a topic compares its name with them one by one.
 const MAX_ENTRIES: usize = 1024;
 /// The names of the priorities.
 const PRIORITIES: [(&str, TopicPriority); 3] =
     [("high", TopicPriority::High), ("normal", TopicPriority::Normal), ("low", TopicPriority::Low)];
 
-/// What the daemon does for the topics and services whose names fit a pattern.
+/// Settings of the daemon for topics and services whose names fit a pattern.
 #[derive(Clone, Debug, PartialEq)]
 #[non_exhaustive]
 pub struct TopicRule {
-    /// Which topics and services.
+    /// Names of the topics and services.
     pub name: TopicPattern,
-    /// What goes first between hosts.
+    /// Priority of the samples between hosts.
     pub priority: TopicPriority,
-    /// Samples a second of each topic that go to each other host at most: the newest, and the rest is dropped.
+    /// Maximum number of samples per second of each topic to each other host. The daemon sends the newest
+    /// and drops the rest. `None` means no limit.
     pub max_hz: Option<f64>,
-    /// Whether samples are compressed for other hosts, where `[link] compression` has them compressed.
+    /// Compression of samples for other hosts. It applies only if `[link] compression` enables compression.
     pub compression: LinkCompression,
 }
 
 impl TopicRule {
-    /// The topics and services whose names fit have this priority.
+    /// Creates a rule that gives this priority to the topics and services whose names fit.
     pub const fn new(name: TopicPattern, priority: TopicPriority) -> Self {
         Self { name, priority, max_hz: None, compression: LinkCompression::Auto }
     }
 
-    /// Their samples are never compressed.
+    /// Disables compression of the samples.
     #[must_use]
     pub const fn uncompressed(mut self) -> Self {
         self.compression = LinkCompression::Never;
         self
     }
 
-    /// Of each topic so many samples a second go to each other host at most.
+    /// Limits each topic to `samples` per second to each other host.
     #[must_use]
     pub const fn max_hz(mut self, samples: f64) -> Self {
         self.max_hz = Some(samples);
@@ -44,19 +45,19 @@ impl TopicRule {
     }
 }
 
-/// What goes first where a link cannot carry all at once.
+/// Order of topics on a link that cannot carry all samples at once.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum TopicPriority {
-    /// After all others.
+    /// After all other topics.
     Low,
-    /// As topics without an entry.
+    /// The priority of topics without an entry.
     #[default]
     Normal,
-    /// Before all others, whatever the length of the samples.
+    /// Before all other topics, whatever the length of the samples.
     High,
 }
 
-/// Reads `[[topic]]`.
+/// Parses `[[topic]]`.
 pub(super) fn rules(value: toml::Value, place: &str) -> Result<Vec<TopicRule>, ConfigError> {
     let toml::Value::Array(entries) = value else {
         return Err(ConfigError::name("topic", "entries that begin with [[topic]]").at(place));
@@ -120,13 +121,13 @@ fn rule(entry: toml::Value, place: &str) -> Result<TopicRule, ConfigError> {
     Ok(TopicRule { name: name.ok_or_else(missing)?, priority, max_hz, compression })
 }
 
-/// The first entry that the name of a topic or service fits.
+/// Returns the first entry that fits the name of a topic or service.
 pub(super) fn first<'r>(rules: &'r [TopicRule], name: &str) -> Option<&'r TopicRule> {
     rules.iter().find(|rule| rule.name.fits(name))
 }
 
 impl TopicRule {
-    /// What [`max_hz`](Self::max_hz) limits.
+    /// Returns the limit that [`max_hz`](Self::max_hz) sets.
     pub(super) fn limit(&self) -> Option<RateLimit> {
         self.max_hz.map(RateLimit::of_rate)
     }

@@ -14,26 +14,26 @@ use super::{
     sources::{self, Setting, SettingOrigin, SettingSources},
 };
 
-/// Most entries of any list.
+/// Maximum number of daemon peers, user IDs or quirks.
 const LONGEST_LIST: usize = 64;
-/// Longest SAE ID, in bytes; the beacon and the envelope have room for no more.
+/// Longest SAE ID, in bytes. The beacon and the envelope have no room for more.
 const LONGEST_SAE_ID: usize = 63;
-/// Longest SAE ID once percent-encoded: the TLS identity is at most 128 bytes, of which
+/// Longest SAE ID after percent-encoding, in bytes. The TLS identity is at most 128 bytes, of which
 /// `axon-qkd-v1:`, `:` and a UUID take 49.
 const LONGEST_ENCODED_SAE_ID: usize = 128 - 12 - 1 - 36;
 
-/// How a file is used, which decides what is asked of it.
+/// Use of a file, which determines its checks.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(super) enum FileUse {
-    /// Certificates, pins: read by the daemon and digested by sessions.
+    /// Certificates and pins, which the daemon reads and sessions digest.
     Public,
-    /// A private key: looked at from outside only.
+    /// A private key. Its content is not read.
     Secret,
     /// A program to start.
     Program,
 }
 
-/// The settings with the file system they name files in.
+/// The settings, and the file system of the files that they name.
 pub(super) struct Values<'a, F> {
     pub(super) sources: &'a SettingSources,
     pub(super) files: &'a F,
@@ -44,7 +44,7 @@ impl<F: Files> Values<'_, F> {
         self.sources.settings.contains_key(name)
     }
 
-    /// An error about the value of `name`, which is set.
+    /// Returns an error about the value of `name`, or about its absence.
     pub(super) fn refuse(&self, name: &str, accepted: impl Into<String>) -> ConfigError {
         match self.sources.settings.get(name) {
             Some(setting) => refuse(name, setting, accepted),
@@ -52,7 +52,7 @@ impl<F: Files> Values<'_, F> {
         }
     }
 
-    /// The text of `name`; set but empty is refused.
+    /// Returns the text of `name`. An empty text is an error.
     fn text(&self, name: &str, accepted: &str) -> Result<Option<&Setting>, ConfigError> {
         match self.sources.settings.get(name) {
             Some(setting) if setting.text.is_empty() => {
@@ -62,7 +62,7 @@ impl<F: Files> Values<'_, F> {
         }
     }
 
-    /// One of a few words.
+    /// Returns the value of one of `words`.
     pub(super) fn choice<T: Copy>(
         &self,
         name: &str,
@@ -79,7 +79,7 @@ impl<F: Files> Values<'_, F> {
         Err(refuse(name, setting, accepted + &hint))
     }
 
-    /// A whole number.
+    /// Returns a whole number in `range`.
     pub(super) fn number(
         &self,
         name: &str,
@@ -94,7 +94,7 @@ impl<F: Files> Values<'_, F> {
         }
     }
 
-    /// Entries separated by `;` or `,`; set but empty is a list of none.
+    /// Returns entries separated by `;` or `,`, without duplicates. An empty text is an empty list.
     fn list<T: PartialEq>(
         &self,
         name: &str,
@@ -119,7 +119,7 @@ impl<F: Files> Values<'_, F> {
         Ok(values)
     }
 
-    /// IP addresses that can be one host's.
+    /// Returns IP addresses that a single host can have.
     pub(super) fn addresses(&self, name: &str, most: usize) -> Result<Vec<IpAddr>, ConfigError> {
         let accepted = "IP addresses separated by ; (not 0.0.0.0, ::, multicast or broadcast)";
         self.list(name, accepted, most, |entry| {
@@ -147,7 +147,7 @@ impl<F: Files> Values<'_, F> {
         let mut quirks = self.list(name, &known.join(", "), LONGEST_LIST, |entry| {
             known.contains(&entry).then(|| entry.to_owned())
         })?;
-        // They are a set: sessions and daemon compare them.
+        // Quirks are a set, and sessions and the daemon compare them.
         quirks.sort_unstable();
         Ok(quirks)
     }
@@ -191,7 +191,7 @@ impl<F: Files> Values<'_, F> {
         let accepted = "https://host, https://host:port or either with a path";
         let Some(setting) = self.text(name, accepted)? else { return Ok(None) };
         if setting.text.contains('@') {
-            // What stands before it may be a password.
+            // The text before `@` may be a password.
             let accepted = format!("{accepted}, without user or password");
             return Err(at(ConfigError::withheld(name, accepted), name, setting));
         }
@@ -201,7 +201,7 @@ impl<F: Files> Values<'_, F> {
         Err(refuse(name, setting, accepted))
     }
 
-    /// A directive list of `tracing`: levels, or `target=level`, separated by commas.
+    /// Returns a directive list of `tracing`: levels, or `target=level`, separated by commas.
     pub(super) fn log_filter(&self, name: &str) -> Result<Option<String>, ConfigError> {
         let accepted = "error, warn, info, debug, trace, off, or target=level, separated by ,";
         let Some(setting) = self.text(name, accepted)? else { return Ok(None) };
@@ -211,7 +211,7 @@ impl<F: Files> Values<'_, F> {
         Err(refuse(name, setting, accepted))
     }
 
-    /// A file that exists, is as private or as public as its use asks, and can be used.
+    /// Returns the path of a file that exists, has a mode that suits its use, and can be used.
     pub(super) fn file(&self, name: &str, usage: FileUse) -> Result<Option<PathBuf>, ConfigError> {
         let Some(setting) = self.text(name, "the path of a file")? else { return Ok(None) };
         let path = self.path(name, setting)?;
@@ -247,7 +247,8 @@ impl<F: Files> Values<'_, F> {
         }
     }
 
-    /// A directory: an absolute path that may be created later, but is no other kind of file.
+    /// Returns the absolute path of a directory. The directory may be absent, but no other kind of file may
+    /// be there.
     pub(super) fn directory(&self, name: &str) -> Result<Option<PathBuf>, ConfigError> {
         let Some(setting) = self.text(name, DIRECTORY)? else { return Ok(None) };
         match absolute_directory(&setting.text, self.files) {
@@ -265,10 +266,10 @@ impl<F: Files> Values<'_, F> {
     }
 }
 
-/// What [`absolute_directory`] takes.
+/// Description of the values that [`absolute_directory`] accepts.
 pub(super) const DIRECTORY: &str = "the absolute path of a directory";
 
-/// An absolute path at which there is a directory, or nothing yet.
+/// Returns `text` as an absolute path if a directory or nothing is there.
 pub(super) fn absolute_directory(text: &str, files: &impl Files) -> Option<PathBuf> {
     let path = PathBuf::from(text);
     let taken = files.facts(&path).is_ok_and(|facts| facts.kind != FileKind::Directory);
@@ -287,7 +288,7 @@ fn at(error: ConfigError, name: &str, setting: &Setting) -> ConfigError {
     }
 }
 
-/// The method of the builder that gives a setting: what the file calls it.
+/// Returns the method of the builder that sets a setting.
 pub(super) fn method(name: &str) -> String {
     let name = name.strip_prefix("AXON_").or(name.strip_prefix("ROS_")).unwrap_or(name);
     let name = name.to_ascii_lowercase();
@@ -299,7 +300,7 @@ fn in_file(name: &str, path: &Path) -> String {
     format!("{key} in {}", path.display())
 }
 
-/// Digits alone: `FromStr` would take a sign too.
+/// Parses digits only: `FromStr` would also accept a sign.
 pub(super) fn decimal(text: &str) -> Option<u64> {
     let digits = !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
     digits.then(|| u64::from_str(text).ok())?
@@ -313,7 +314,7 @@ fn is_sae_id(text: &str) -> bool {
         && encoded <= LONGEST_ENCODED_SAE_ID
 }
 
-/// `host`, `host:port`, `v4`, `v4:port`, `v6`, `[v6]` or `[v6]:port`.
+/// Parses `host`, `host:port`, `v4`, `v4:port`, `v6`, `[v6]` or `[v6]:port`.
 fn peer_address(text: &str) -> Option<PeerAddress> {
     if let Ok(address) = text.parse::<IpAddr>() {
         return Some(PeerAddress { host: address.to_string(), port: None });
@@ -343,8 +344,8 @@ fn peer_address(text: &str) -> Option<PeerAddress> {
     Some(PeerAddress { host: host.to_owned(), port })
 }
 
-/// A name to look up: labels of letters, digits, `-` and `_`, the last one not a number (`10.0.0.256`
-/// is a mistyped address, not a name).
+/// Returns whether `text` is a host name: labels of letters, digits, `-` and `_`, the last one not a
+/// number. `10.0.0.256` is a mistyped address, not a name.
 pub(super) fn is_host_name(text: &str) -> bool {
     let name = text.strip_suffix('.').unwrap_or(text);
     let label = |label: &str| {
@@ -361,7 +362,7 @@ fn is_https_url(text: &str) -> bool {
     text.len() <= 2048
         && text.bytes().all(|byte| byte.is_ascii_graphic() && !b"\"<>\\^`{|}?#".contains(&byte))
         && peer_address(authority).is_some()
-        // A bare IPv6 address is a peer but no authority.
+        // A bare IPv6 address is a peer, but not an authority.
         && (authority.starts_with('[') || authority.matches(':').count() <= 1)
 }
 

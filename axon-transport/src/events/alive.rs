@@ -1,16 +1,16 @@
-//! Collects which publishers asserted their liveliness. The collection is sent to processes and hosts that cannot see
-//! the assertions themselves, in time for the shortest lease.
+//! Collects the publishers that asserted their liveliness. The collection is sent to processes and hosts that cannot
+//! see the assertions themselves, in time for the shortest lease.
 
 use std::{collections::BTreeMap, time::Duration};
 
 use crate::ids::Gid;
 
-/// The shortest time between two looks.
+/// The shortest time between two reports.
 const SHORTEST: Duration = Duration::from_millis(5);
-/// Publishers in one message.
+/// Maximum number of publishers in one message.
 const PART: usize = 1024;
 
-/// What one end tells another of its publishers' leases.
+/// The state of the liveliness reports from one end to another.
 #[derive(Default)]
 pub struct Alive {
     every: Option<Duration>,
@@ -19,20 +19,20 @@ pub struct Alive {
 }
 
 impl Alive {
-    /// These are the leases of the publishers that count.
+    /// Sets the leases of the publishers to report.
     pub fn watch(&mut self, leases: impl Iterator<Item = Duration>) {
         self.every = leases.min().map(|least| (least / 4).max(SHORTEST));
     }
 
-    /// How long it is until the next look; `None` when nobody has a lease.
+    /// Returns the time until the next report, or `None` without leases.
     pub fn left(&self, now: Duration) -> Option<Duration> {
         let every = self.every?;
         let since = self.looked.map(|looked| now.saturating_sub(looked));
         Some(since.map_or(Duration::ZERO, |since| every.saturating_sub(since)))
     }
 
-    /// If it is time: those that have been alive since this was last asked, as many together as go into
-    /// a message. `asserted` has when each was; a publisher may be in it several times.
+    /// Returns the publishers asserted since the last report, in groups of at most one message, if the report is due.
+    /// `asserted` contains the times of assertions; a publisher may occur several times.
     pub fn due_assertions(
         &mut self,
         now: Duration,
@@ -80,7 +80,7 @@ mod tests {
         assert_eq!(alive.left(start), Some(quarter));
         let early = start + quarter / 2;
         assert!(alive.due_assertions(early, [(gid(2), 2)].into_iter()).is_empty(), "not yet");
-        // What stands is no news, in whatever order it comes; who was not heard of meanwhile is.
+        // A known assertion is not reported again, in any order. A newer assertion or a new publisher is reported.
         let next = start + quarter;
         let now = [(gid(1), 3), (gid(1), 1), (gid(2), 2), (gid(3), 1)];
         assert_eq!(alive.due_assertions(next, now.into_iter()), [[gid(2), gid(3)]]);

@@ -1,28 +1,29 @@
 //! Deadlines: the longest permitted time between two samples.
 
-/// Watches one deadline. It runs from the first sample on: a writer that has never sent anything
-/// has missed nothing (DDS 1.4, 2.2.3.7: the deadline is an instance's, which the first sample makes).
+/// Monitors one deadline, from the first sample on. A writer that never sent a sample has missed no
+/// deadline (DDS 1.4, 2.2.3.7: the deadline belongs to an instance, which the first sample creates).
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Deadline {
     period: u64,
-    /// When it runs out next.
+    /// The next expiry. `None` before the first sample.
     due: Option<u64>,
 }
 
 impl Deadline {
-    /// A deadline of `period` nanoseconds; 0 is taken for 1.
+    /// Creates a deadline of `period` nanoseconds; 0 counts as 1.
     pub(crate) fn new(period: u64) -> Self {
         Self { period: period.max(1), due: None }
     }
 
-    /// A sample was sent, or came, at `at`. One that is older than what is known changes nothing.
+    /// Records a sample that was sent or received at `at`. A sample older than the newest one changes
+    /// nothing.
     pub(crate) fn sample(&mut self, at: u64) {
         let due = at.saturating_add(self.period);
         self.due = Some(self.due.map_or(due, |known| known.max(due)));
     }
 
-    /// How many deadlines have passed until `now`, since this was last asked: one for every period
-    /// without a sample.
+    /// Returns the number of deadlines missed until `now`, since the last call: one for each period without
+    /// a sample.
     pub(crate) fn missed(&mut self, now: u64) -> u64 {
         let Some(due) = self.due.filter(|due| *due <= now) else { return 0 };
         let missed = (now - due) / self.period + 1;
@@ -30,7 +31,7 @@ impl Deadline {
         missed
     }
 
-    /// When to ask again; `None` before the first sample.
+    /// Returns the time of the next check, or `None` before the first sample.
     pub(crate) fn due(&self) -> Option<u64> {
         self.due
     }
@@ -53,7 +54,7 @@ mod tests {
         assert_eq!((deadline.missed(109), deadline.due()), (0, Some(110)));
         assert_eq!((deadline.missed(110), deadline.due()), (1, Some(120)));
         assert_eq!(deadline.missed(110), 0);
-        // Asked late: all that passed meanwhile.
+        // A late call counts all deadlines that passed meanwhile.
         assert_eq!((deadline.missed(149), deadline.due()), (3, Some(150)));
         deadline.sample(155);
         assert_eq!((deadline.missed(164), deadline.due()), (0, Some(165)));

@@ -4,23 +4,23 @@ use std::collections::HashMap;
 
 use crate::ids::Gid;
 
-/// One lease, as its owner watches it: a publisher its own.
+/// A lease and its last assertion.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Lease {
-    /// `None` never runs out.
+    /// Duration in nanoseconds. `None` never expires.
     duration: Option<u64>,
     asserted: u64,
     alive: bool,
 }
 
 impl Lease {
-    /// A lease of `duration` nanoseconds that is asserted at `now`.
+    /// Creates a lease of `duration` nanoseconds that is asserted at `now`.
     pub(crate) fn new(duration: Option<u64>, now: u64) -> Self {
         Self { duration: duration.map(|d| d.max(1)), asserted: now, alive: true }
     }
 
-    /// It was asserted at `at`. Whether that brings it back to life: one that is known already does
-    /// not.
+    /// Asserts the lease at `at`. Returns whether it was expired before. An assertion that is already known
+    /// changes nothing.
     pub(crate) fn assert(&mut self, at: u64) -> bool {
         if at <= self.asserted {
             return false;
@@ -29,7 +29,7 @@ impl Lease {
         !std::mem::replace(&mut self.alive, true)
     }
 
-    /// Whether it has run out by `now`, and had not when this was last asked.
+    /// Returns whether the lease expired by `now`, once per expiry.
     pub(crate) fn ran_out(&mut self, now: u64) -> bool {
         let over = self.due().is_some_and(|due| due <= now);
         if over {
@@ -38,22 +38,22 @@ impl Lease {
         over
     }
 
-    /// When it runs out; `None` when it never does, or has.
+    /// Returns the time of the expiry, or `None` if the lease never expires or has already expired.
     pub(crate) fn due(&self) -> Option<u64> {
         let due = self.asserted.saturating_add(self.duration?);
         self.alive.then_some(due)
     }
 }
 
-/// The publishers of a subscription, by whether they are alive. Each change is returned as what
-/// it adds to the numbers of those alive and of those not.
+/// The leases of a subscription's publishers. Each change returns what it adds to the number of alive
+/// publishers and to the number of publishers that are not alive.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Liveness {
     leases: HashMap<Gid, Lease>,
 }
 
 impl Liveness {
-    /// A publisher was matched, with the lease that it offers.
+    /// Adds a matched publisher, with the lease that it offers.
     pub(crate) fn matched(&mut self, publisher: Gid, lease: Option<u64>, now: u64) -> (i64, i64) {
         match self.leases.insert(publisher, Lease::new(lease, now)) {
             None => (1, 0),
@@ -62,7 +62,7 @@ impl Liveness {
         }
     }
 
-    /// A publisher is gone.
+    /// Removes a publisher.
     pub(crate) fn unmatched(&mut self, publisher: &Gid) -> (i64, i64) {
         match self.leases.remove(publisher) {
             None => (0, 0),
@@ -71,24 +71,24 @@ impl Liveness {
         }
     }
 
-    /// A publisher asserted its liveliness at `at`.
+    /// Asserts the liveliness of a publisher at `at`.
     pub(crate) fn assert(&mut self, publisher: &Gid, at: u64) -> (i64, i64) {
         let revived = self.leases.get_mut(publisher).is_some_and(|lease| lease.assert(at));
         if revived { (1, -1) } else { (0, 0) }
     }
 
-    /// The leases that ran out until `now`.
+    /// Expires the leases that end by `now`.
     pub(crate) fn ran_out(&mut self, now: u64) -> (i64, i64) {
         let over = self.leases.values_mut().map(|lease| i64::from(lease.ran_out(now))).sum::<i64>();
         (-over, over)
     }
 
-    /// Whether a lease has run out and was not asserted again.
+    /// Returns whether a lease has expired and was not asserted again.
     pub(crate) fn any_dead(&self) -> bool {
         self.leases.values().any(|lease| !lease.alive)
     }
 
-    /// When the next lease runs out.
+    /// Returns the time of the next expiry.
     pub(crate) fn due(&self) -> Option<u64> {
         self.leases.values().filter_map(Lease::due).min()
     }

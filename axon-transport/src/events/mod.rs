@@ -1,8 +1,8 @@
 //! The events that an endpoint can report: the eleven events of ROS 2, their status counts, and the rules by which
 //! deadlines and leases expire.
 //!
-//! Plain data: time comes in as nanoseconds of one monotonic clock, and no function waits. A session's control thread
-//! feeds these state machines, and passes their news to wait sets and callbacks.
+//! This module does no I/O. The caller passes times as nanoseconds of one monotonic clock, and no function blocks. A
+//! session's control thread feeds these state machines and passes their events to wait sets and callbacks.
 
 pub(crate) mod alive;
 mod deadline;

@@ -30,7 +30,7 @@ pub enum EventKind {
 }
 
 impl EventKind {
-    /// Every event.
+    /// All events.
     pub const ALL: [Self; 11] = [
         Self::LivelinessChanged,
         Self::RequestedDeadlineMissed,
@@ -45,7 +45,7 @@ impl EventKind {
         Self::PublicationMatched,
     ];
 
-    /// Whether it is a publisher's event; else it is a subscription's.
+    /// Returns whether this is a publisher's event. All other events are a subscription's.
     pub fn is_publishers(self) -> bool {
         matches!(
             self,
@@ -58,78 +58,78 @@ impl EventKind {
     }
 }
 
-/// How often something happened.
+/// The number of occurrences of an event.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct CountStatus {
-    /// In all.
+    /// The total.
     pub total: u64,
-    /// Since the status was last taken.
+    /// Occurrences since the status was last taken.
     pub change: u64,
 }
 
 impl CountStatus {
-    /// So often in all, and since the status was last taken.
+    /// Creates a status from the total count and the change since the last take.
     pub fn new(total: u64, change: u64) -> Self {
         Self { total, change }
     }
 }
 
-/// Endpoints that were and are matched.
+/// Numbers of matched endpoints.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Matched {
-    /// Matched ever.
+    /// Total number of matches.
     pub total: u64,
-    /// Matched since the status was last taken.
+    /// Matches since the status was last taken.
     pub total_change: u64,
-    /// Matched now.
+    /// Endpoints that are matched now.
     pub current: u64,
-    /// The difference to when the status was last taken.
+    /// Change of `current` since the status was last taken.
     pub current_change: i64,
 }
 
 impl Matched {
-    /// So many ever and now, each with the difference to when the status was last taken.
+    /// Creates a status from the totals and their changes since the last take.
     pub fn new(total: u64, total_change: u64, current: u64, current_change: i64) -> Self {
         Self { total, total_change, current, current_change }
     }
 }
 
-/// Endpoints whose QoS does not go with this one's.
+/// Endpoints whose QoS is incompatible with this endpoint's.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct IncompatibleQos {
-    /// How many, ever.
+    /// Number of such endpoints.
     pub count: CountStatus,
-    /// A policy that kept the last of them apart.
+    /// An incompatible policy of the last such endpoint.
     pub last_policy: Option<Incompatible>,
 }
 
-/// A subscription's publishers, by whether they are alive.
+/// Numbers of a subscription's publishers that are alive and not alive.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct LivelinessChanged {
-    /// Alive now.
+    /// Publishers that are alive now.
     pub alive: u64,
-    /// Matched, and not alive now.
+    /// Publishers that are matched and not alive now.
     pub not_alive: u64,
-    /// The difference of `alive` to when the status was last taken.
+    /// Change of `alive` since the status was last taken.
     pub alive_change: i64,
-    /// The difference of `not_alive` to when the status was last taken.
+    /// Change of `not_alive` since the status was last taken.
     pub not_alive_change: i64,
 }
 
-/// What is known of one event.
+/// The status of one event.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum EventStatus {
-    /// Of an event that is counted and no more.
+    /// The status of an event that is only counted.
     Counted(CountStatus),
-    /// Of [`EventKind::SubscriptionMatched`] and [`EventKind::PublicationMatched`].
+    /// The status of [`EventKind::SubscriptionMatched`] and [`EventKind::PublicationMatched`].
     Matched(Matched),
-    /// Of [`EventKind::RequestedQosIncompatible`] and [`EventKind::OfferedQosIncompatible`].
+    /// The status of [`EventKind::RequestedQosIncompatible`] and [`EventKind::OfferedQosIncompatible`].
     IncompatibleQos(IncompatibleQos),
-    /// Of [`EventKind::LivelinessChanged`].
+    /// The status of [`EventKind::LivelinessChanged`].
     LivelinessChanged(LivelinessChanged),
 }
 
@@ -142,7 +142,7 @@ pub(crate) struct Statuses {
     incompatible_qos: IncompatibleQos,
     incompatible_type: CountStatus,
     deadline: CountStatus,
-    /// A publisher's leases that ran out.
+    /// Expired leases of a publisher.
     lease: CountStatus,
     lost: CountStatus,
     /// Occurrences of each event since its status was last taken.
@@ -150,12 +150,12 @@ pub(crate) struct Statuses {
 }
 
 impl Statuses {
-    /// Those of a publisher.
+    /// Creates the statuses of a publisher.
     pub(crate) fn of_publisher() -> Self {
         Self::new(true)
     }
 
-    /// Those of a subscription.
+    /// Creates the statuses of a subscription.
     pub(crate) fn of_subscription() -> Self {
         Self::new(false)
     }
@@ -174,14 +174,13 @@ impl Statuses {
         }
     }
 
-    /// How often the event occurred since its status was last taken. A wait set is woken while
-    /// this is not 0.
+    /// Returns the occurrences of the event since its status was last taken. A wait set is woken while this
+    /// is not 0.
     pub(crate) fn unread(&self, kind: EventKind) -> u64 {
         self.unread[kind as usize]
     }
 
-    /// The status, whose changes are counted anew from here. `None` when the endpoint has no such
-    /// event.
+    /// Returns the status and resets its changes. Returns `None` if the endpoint has no such event.
     pub(crate) fn take(&mut self, kind: EventKind) -> Option<EventStatus> {
         if kind.is_publishers() != self.publisher {
             return None;
@@ -215,7 +214,7 @@ impl Statuses {
         })
     }
 
-    /// An endpoint was matched.
+    /// Counts a match.
     pub(crate) fn matched(&mut self) -> EventKind {
         self.matched.total += 1;
         self.matched.total_change += 1;
@@ -224,21 +223,21 @@ impl Statuses {
         self.occurred(EventKind::PublicationMatched, EventKind::SubscriptionMatched, 1)
     }
 
-    /// An endpoint that was matched is so no more.
+    /// Counts the end of a match.
     pub(crate) fn unmatched(&mut self) -> EventKind {
         self.matched.current = self.matched.current.saturating_sub(1);
         self.matched.current_change -= 1;
         self.occurred(EventKind::PublicationMatched, EventKind::SubscriptionMatched, 1)
     }
 
-    /// An endpoint was met whose QoS does not go with this one's.
+    /// Counts an endpoint whose QoS is incompatible with this endpoint's.
     pub(crate) fn incompatible_qos(&mut self, policy: Incompatible) -> EventKind {
         self.incompatible_qos.count.add(1);
         self.incompatible_qos.last_policy = Some(policy);
         self.occurred(EventKind::OfferedQosIncompatible, EventKind::RequestedQosIncompatible, 1)
     }
 
-    /// An endpoint of the same topic was met whose type is another.
+    /// Counts an endpoint of the same topic with another type.
     pub(crate) fn incompatible_type(&mut self) -> EventKind {
         self.incompatible_type.add(1);
         let (publisher, subscription) =
@@ -246,7 +245,7 @@ impl Statuses {
         self.occurred(publisher, subscription, 1)
     }
 
-    /// Deadlines were missed; at least one.
+    /// Counts missed deadlines. `count` is at least 1.
     pub(crate) fn deadlines_missed(&mut self, count: u64) -> EventKind {
         self.deadline.add(count);
         let (offered, requested) =
@@ -254,19 +253,19 @@ impl Statuses {
         self.occurred(offered, requested, count)
     }
 
-    /// A publisher's own lease ran out.
+    /// Counts an expiry of a publisher's own lease.
     pub(crate) fn liveliness_lost(&mut self) -> EventKind {
         self.lease.add(1);
         self.note(EventKind::LivelinessLost, 1)
     }
 
-    /// A subscription lost samples; at least one.
+    /// Counts samples that a subscription lost. `count` is at least 1.
     pub(crate) fn lost(&mut self, count: u64) -> EventKind {
         self.lost.add(count);
         self.note(EventKind::MessageLost, count)
     }
 
-    /// A subscription's publishers are alive, or not, in these numbers.
+    /// Adds to the numbers of a subscription's publishers that are alive and not alive.
     pub(crate) fn liveliness_changed(&mut self, alive: i64, not_alive: i64) -> EventKind {
         let status = &mut self.liveliness;
         status.alive = status.alive.saturating_add_signed(alive);
@@ -295,7 +294,7 @@ impl Statuses {
 
 impl CountStatus {
     fn add(&mut self, count: u64) {
-        // Losses are counted by numbers that another host says.
+        // Another host may state the number of lost samples, so the sum saturates.
         self.total = self.total.saturating_add(count);
         self.change = self.change.saturating_add(count);
     }

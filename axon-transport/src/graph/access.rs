@@ -1,9 +1,9 @@
-//! What access rules say of endpoints. The gateway asks for those of other hosts, the registry for those of other users.
+//! Access rules for endpoints. The gateway checks endpoints of other hosts, the registry those of other users.
 
 use super::{Endpoint, EndpointKind};
 use crate::access::{Permissions, Verb};
 
-/// What the owner of an endpoint does with its topic or service; `None` of a node.
+/// Returns the action of an endpoint's owner on its topic or service, or `None` for a node.
 pub fn verb_of(kind: EndpointKind) -> Option<Verb> {
     Some(match kind {
         EndpointKind::Publisher => Verb::Publish,
@@ -14,7 +14,7 @@ pub fn verb_of(kind: EndpointKind) -> Option<Verb> {
     })
 }
 
-/// What the owner of an endpoint on the other side of a pair does.
+/// Returns the action of the endpoint's owner on the other side of a pair.
 pub fn other_end(verb: Verb) -> Verb {
     match verb {
         Verb::Publish => Verb::Subscribe,
@@ -25,7 +25,8 @@ pub fn other_end(verb: Verb) -> Verb {
     }
 }
 
-/// Whether a party may have this endpoint. A node does nothing by itself: it is there for a party that may do anything.
+/// Returns whether a party may have this endpoint. It may have a node if it may publish, subscribe to, serve or call
+/// anything.
 pub fn permits(party: &Permissions, endpoint: &Endpoint) -> bool {
     match verb_of(endpoint.kind) {
         Some(verb) => party.allows(verb, &endpoint.topic),
@@ -33,14 +34,14 @@ pub fn permits(party: &Permissions, endpoint: &Endpoint) -> bool {
     }
 }
 
-/// Whether a party may be at the other end of this endpoint of another party.
+/// Returns whether a party may own the other end of another party's endpoint.
 pub fn permits_use(party: &Permissions, endpoint: &Endpoint) -> bool {
     let denied = |verb| !party.allows(other_end(verb), &endpoint.topic);
     party.are_unrestricted() || !verb_of(endpoint.kind).is_some_and(denied)
 }
 
-/// Whether a party is shown this endpoint of another party: it may see the topic, or needs the endpoint for its own. For
-/// a node the full name counts.
+/// Returns whether a party may see another party's endpoint. It may if it may see the topic, or needs the endpoint as
+/// the other end of its own. For a node, the full name decides.
 pub fn shows(party: &Permissions, endpoint: &Endpoint) -> bool {
     if party.are_unrestricted() {
         return true;

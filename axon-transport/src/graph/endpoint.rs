@@ -5,7 +5,7 @@ use serde::Serialize;
 
 use crate::{ids::Gid, qos::Qos};
 
-/// What an endpoint does.
+/// The kind of an endpoint.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Encode, Decode, Serialize)]
 #[cbor(index_only)]
 #[serde(rename_all = "snake_case")]
@@ -22,7 +22,7 @@ pub enum EndpointKind {
     /// Sends requests.
     #[n(3)]
     Client,
-    /// Is there: a node has a name, whether or not it has endpoints.
+    /// A node, which has a name and possibly no endpoints.
     #[n(4)]
     Node,
 }
@@ -32,10 +32,10 @@ pub enum EndpointKind {
 #[cbor(map)]
 #[non_exhaustive]
 pub struct Endpoint {
-    /// Its identity.
+    /// The identity.
     #[n(0)]
     pub gid: Gid,
-    /// What it does.
+    /// The kind.
     #[n(1)]
     pub kind: EndpointKind,
     /// The full topic or service name; empty for a node.
@@ -44,24 +44,24 @@ pub struct Endpoint {
     /// The type's name. Endpoints match on topic and type. Empty for a node.
     #[n(3)]
     pub type_name: String,
-    /// The type's hash; empty when unknown.
+    /// The type's hash; empty if unknown.
     #[cbor(n(4), with = "minicbor::bytes")]
     pub type_hash: Vec<u8>,
-    /// What it offers or requests.
+    /// QoS that is offered or requested.
     #[n(5)]
     pub qos: Qos,
-    /// The node it belongs to; empty when it belongs to none.
+    /// The name of the node; empty without a node.
     #[n(6)]
     pub node: String,
-    /// That node's namespace.
+    /// The node's namespace.
     #[n(7)]
     pub namespace: String,
-    /// For a node, the security enclave that it runs in; else empty.
+    /// For a node, the security enclave that it runs in; otherwise empty.
     #[cbor(n(8), default)]
     pub enclave: String,
 }
 
-/// Upper bounds on what a peer or session may describe.
+/// Upper bounds on the descriptions of a peer or session.
 #[derive(Clone, Copy, Debug)]
 pub struct Limits {
     /// Bytes of a topic, type, node or namespace name.
@@ -75,11 +75,12 @@ pub struct Limits {
 /// The bounds in force.
 pub const LIMITS: Limits = Limits { name: 512, type_hash: 64, endpoints: 65_536 };
 
-/// Bytes that an endpoint takes in the tables that know it, its names aside.
+/// Bytes that an endpoint takes in tables, without its names and type hash.
 const ENTRY: usize = size_of::<Endpoint>() + 128;
 
 impl Endpoint {
-    /// An endpoint of a topic or service and a type, with the default QoS, without a type hash and of no node.
+    /// Creates an endpoint of a topic or service and a type, with the default QoS, no type hash and no
+    /// node.
     pub fn new(
         gid: Gid,
         kind: EndpointKind,
@@ -99,37 +100,38 @@ impl Endpoint {
         }
     }
 
-    /// With this QoS.
+    /// Sets the QoS.
     #[must_use]
     pub fn with_qos(self, qos: Qos) -> Self {
         Self { qos, ..self }
     }
 
-    /// With this hash of its type.
+    /// Sets the hash of the type.
     #[must_use]
     pub fn with_type_hash(self, type_hash: Vec<u8>) -> Self {
         Self { type_hash, ..self }
     }
 
-    /// Of this node in this namespace.
+    /// Sets the node and its namespace.
     #[must_use]
     pub fn with_node(self, node: impl Into<String>, namespace: impl Into<String>) -> Self {
         Self { node: node.into(), namespace: namespace.into(), ..self }
     }
 
-    /// In this security enclave: for a node.
+    /// Sets the security enclave of a node.
     #[must_use]
     pub fn with_enclave(self, enclave: impl Into<String>) -> Self {
         Self { enclave: enclave.into(), ..self }
     }
 
-    /// Bytes that count for it where memory is bounded: its names and what keeps it.
+    /// Returns the bytes that count towards memory limits: the names, the type hash and the table entries.
     pub fn bytes(&self) -> usize {
         let names = [&self.topic, &self.type_name, &self.node, &self.namespace, &self.enclave];
         ENTRY + self.type_hash.len() + names.iter().map(|name| name.len()).sum::<usize>()
     }
 
-    /// Whether every field is within [`LIMITS`], what must be named is, and the depth is usable.
+    /// Returns whether every field is within [`LIMITS`], no name contains NUL, the kind has the names that
+    /// it requires and no others, and the history depth is at least 1.
     pub fn is_sane(&self) -> bool {
         let names = [&self.topic, &self.type_name, &self.node, &self.namespace, &self.enclave];
         let named = if self.kind == EndpointKind::Node {
@@ -146,7 +148,7 @@ impl Endpoint {
 
 #[cfg(test)]
 impl Endpoint {
-    /// An endpoint of the topic `/t` and the type `T`, with the default QoS and of no node.
+    /// Creates an endpoint of the topic `/t` and the type `T`, with the default QoS and no node.
     pub(crate) fn example(gid: Gid, kind: EndpointKind) -> Self {
         Self::new(gid, kind, "/t", "T")
     }

@@ -1,6 +1,6 @@
 //! The graph: which nodes and endpoints exist, on this host and on others.
 //!
-//! Plain data in, data out; the daemon and the gateway move it.
+//! This module does no I/O. The daemon and the gateway transfer the data.
 
 pub(crate) mod access;
 pub(crate) mod endpoint;

@@ -4,30 +4,30 @@
 use super::{Endpoint, EndpointKind};
 use crate::qos::{Incompatible, compatible};
 
-/// What two endpoints are to each other.
+/// The relation of two endpoints.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Pairing {
-    /// Nothing: other names, or kinds that do not speak with each other.
+    /// No relation: the names differ, or the kinds do not communicate.
     Unrelated,
-    /// One writes what the other reads.
+    /// The writer's samples go to the reader.
     Match,
-    /// They would, but for this policy.
+    /// A match, except for this QoS policy.
     IncompatibleQos(Incompatible),
-    /// They have the same name and mean different types by it.
+    /// The names are equal, but the types differ.
     IncompatibleType,
 }
 
-/// Whether an endpoint of this kind writes: a server its responses, a client its requests.
+/// Returns whether an endpoint of this kind writes. A server writes responses, a client writes requests.
 pub fn writes(kind: EndpointKind) -> bool {
     matches!(kind, EndpointKind::Publisher | EndpointKind::Server | EndpointKind::Client)
 }
 
-/// Whether an endpoint of this kind reads: a server requests, a client responses.
+/// Returns whether an endpoint of this kind reads. A server reads requests, a client reads responses.
 pub fn reads(kind: EndpointKind) -> bool {
     matches!(kind, EndpointKind::Subscription | EndpointKind::Server | EndpointKind::Client)
 }
 
-/// What `writer` is to `reader`. Types are the same when their names are, and their hashes where
+/// Returns the relation of `writer` to `reader`. Types are equal if their names are equal, and their hashes too if
 /// both are known.
 pub fn pairing(writer: &Endpoint, reader: &Endpoint) -> Pairing {
     use EndpointKind::{Client, Publisher, Server, Subscription};
@@ -44,7 +44,7 @@ pub fn pairing(writer: &Endpoint, reader: &Endpoint) -> Pairing {
     }
     let mut offered = compatible(&writer.qos, &reader.qos);
     if reader.kind != Subscription {
-        // Requests and responses go together, or neither goes.
+        // A service matches only if both requests and responses match.
         offered = offered.and(compatible(&reader.qos, &writer.qos));
     }
     offered.map_or_else(Pairing::IncompatibleQos, |()| Pairing::Match)
@@ -96,7 +96,7 @@ mod tests {
         assert_eq!(pairing(&hash(&[1, 3]), &reader), Pairing::IncompatibleType);
         let renamed = Endpoint { type_name: "U".into(), ..hash(&[1, 2]) };
         assert_eq!(pairing(&renamed, &reader), Pairing::IncompatibleType);
-        // Of another topic, the type does not matter.
+        // The type does not matter if the topics differ.
         let elsewhere = Endpoint { topic: "/u".into(), ..renamed };
         assert_eq!(pairing(&elsewhere, &reader), Pairing::Unrelated);
     }

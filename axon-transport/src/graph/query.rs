@@ -4,28 +4,28 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::{EndpointKind, GraphEntry, GraphView};
 
-/// A node as the graph lists it. Two nodes may have the same name: it lists both.
+/// A node as the graph lists it. The graph lists each node, even if two have the same name.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[non_exhaustive]
 pub struct NodeName {
-    /// Its namespace.
+    /// The namespace.
     pub namespace: String,
-    /// Its name.
+    /// The name.
     pub name: String,
-    /// The security enclave that it runs in.
+    /// The security enclave that the node runs in.
     pub enclave: String,
 }
 
-/// Types by topic or service name, both in order.
+/// Types by topic or service name, both sorted.
 pub type NamesAndTypes = BTreeMap<String, BTreeSet<String>>;
 
-/// What endpoints publish or subscribe to.
+/// Kinds of the endpoints of a topic.
 pub const TOPIC_KINDS: [EndpointKind; 2] = [EndpointKind::Publisher, EndpointKind::Subscription];
-/// What endpoints serve or ask of each other.
+/// Kinds of the endpoints of a service.
 pub const SERVICE_KINDS: [EndpointKind; 2] = [EndpointKind::Server, EndpointKind::Client];
 
 impl GraphView {
-    /// Every node, in order.
+    /// Returns all nodes, sorted.
     pub fn nodes(&self) -> Vec<NodeName> {
         let mut nodes: Vec<NodeName> = self
             .of(&[EndpointKind::Node])
@@ -39,18 +39,18 @@ impl GraphView {
         nodes
     }
 
-    /// Whether there is a node of this name.
+    /// Returns whether a node has this name and namespace.
     pub fn has_node(&self, name: &str, namespace: &str) -> bool {
         self.of(&[EndpointKind::Node]).any(|entry| belongs(entry, name, namespace))
     }
 
-    /// The names of the endpoints of the given `kinds`, with their types.
+    /// Returns the names of the endpoints of the given `kinds`, with their types.
     pub fn names_and_types(&self, kinds: &[EndpointKind]) -> NamesAndTypes {
         collect(self.of(kinds))
     }
 
-    /// As [`names_and_types`](Self::names_and_types), of one node's endpoints. `None` when there is
-    /// no such node.
+    /// Like [`names_and_types`](Self::names_and_types), for one node's endpoints. Returns `None` if the
+    /// node does not exist.
     pub fn names_and_types_of(
         &self,
         name: &str,
@@ -61,7 +61,7 @@ impl GraphView {
         self.has_node(name, namespace).then(|| collect(of_node))
     }
 
-    /// The endpoints of a kind under a topic or service name, by GID.
+    /// Returns the endpoints of a kind under a topic or service name, sorted by GID.
     pub fn endpoints_of(&self, kind: EndpointKind, topic: &str) -> Vec<&GraphEntry> {
         let named = |entry: &&GraphEntry| entry.endpoint.topic == topic;
         let mut entries: Vec<&GraphEntry> = self.of(&[kind]).filter(named).collect();
@@ -69,14 +69,14 @@ impl GraphView {
         entries
     }
 
-    /// The endpoints of a kind, by topic or service name and GID.
+    /// Returns the endpoints of a kind, sorted by topic or service name and GID.
     pub fn endpoints_of_kind(&self, kind: EndpointKind) -> Vec<&GraphEntry> {
         let mut entries: Vec<&GraphEntry> = self.of(&[kind]).collect();
         entries.sort_by_key(|entry| (&entry.endpoint.topic, entry.endpoint.gid));
         entries
     }
 
-    /// How many endpoints of a kind are under a topic or service name.
+    /// Returns the number of endpoints of a kind under a topic or service name.
     pub fn count(&self, kind: EndpointKind, topic: &str) -> usize {
         self.of(&[kind]).filter(|entry| entry.endpoint.topic == topic).count()
     }
@@ -167,7 +167,7 @@ mod tests {
         let view = view();
         assert_eq!(view.names_and_types_of("idle", "/ns", &TOPIC_KINDS), Some(BTreeMap::new()));
         assert_eq!(view.names_and_types_of("idle", "/", &TOPIC_KINDS), None);
-        // Endpoints that name a node which is not announced do not make it one.
+        // Endpoints that name an unannounced node do not add the node.
         assert_eq!(view.names_and_types_of("listener", "/ns", &TOPIC_KINDS), None);
         let published = view.names_and_types_of("talker", "/ns", &[Publisher]).unwrap();
         assert_eq!(names(&published), [("/chatter", vec!["Int", "String"])]);

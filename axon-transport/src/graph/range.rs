@@ -8,9 +8,9 @@ use minicbor::{Decode, Encode};
 use super::Endpoint;
 use crate::{config::DiscoveryRange, ids::DaemonId};
 
-/// As many static peers as rcl takes.
+/// Maximum number of static peers, as in rcl.
 const MOST_PEERS: usize = 32;
-/// Longest name of a host.
+/// Longest name of a host, in bytes.
 const MOST_NAME: usize = 253;
 
 /// The discovery range and the static peers of a session.
@@ -20,19 +20,19 @@ pub struct Scope {
     pub range: DiscoveryRange,
     /// Addresses or host names; empty in OFF.
     pub static_peers: Vec<String>,
-    /// Whether the session stated its range. One that did not is LOCALHOST.
+    /// True if the session stated its range. A session that did not is LOCALHOST.
     pub stated: bool,
 }
 
 impl Scope {
-    /// What a session says of itself: the range's [number](DiscoveryRange::number), and its static
-    /// peers. Where it says nothing it is kept to its host, since its library knows no better.
+    /// Creates the scope that a session states: the range's [number](DiscoveryRange::number), and the static peers. A
+    /// session without a number stays on its host, because its library does not know ranges.
     pub fn of(range: Option<u8>, mut static_peers: Vec<String>) -> Self {
         let stated = range.is_some();
         let range = match range {
             Some(0) => DiscoveryRange::Subnet,
             None | Some(1) => DiscoveryRange::Localhost,
-            // OFF, and what a later version may mean.
+            // OFF, and numbers of later versions.
             Some(_) => DiscoveryRange::Off,
         };
         let lists = stated && range != DiscoveryRange::Off;
@@ -58,7 +58,7 @@ pub struct EndpointRange {
 }
 
 impl EndpointRange {
-    /// What it comes to towards one peer.
+    /// Returns the range towards one peer.
     pub fn toward(&self, peer: DaemonId) -> RangeToHost {
         RangeToHost { range: self.range, lists: self.lists.contains(&peer) }
     }
@@ -69,7 +69,7 @@ impl EndpointRange {
 pub struct RangeToHost {
     /// The range.
     pub range: DiscoveryRange,
-    /// Whether the host of the other endpoint is among the session's static peers.
+    /// True if the session's static peers include the host of the other endpoint.
     pub lists: bool,
 }
 
@@ -78,19 +78,19 @@ pub struct RangeToHost {
 pub struct RemoteEndpoint {
     /// The endpoint.
     pub endpoint: Arc<Endpoint>,
-    /// The range of its session towards this host.
+    /// The range of the endpoint's session towards this host.
     pub toward: RangeToHost,
 }
 
 impl From<Endpoint> for RemoteEndpoint {
-    /// An endpoint whose daemon says nothing of ranges: its session is SUBNET and lists nobody.
+    /// Creates an endpoint whose daemon states no range. Its session is SUBNET and lists no host.
     fn from(endpoint: Endpoint) -> Self {
         let toward = RangeToHost { range: DiscoveryRange::Subnet, lists: false };
         Self { endpoint: Arc::new(endpoint), toward }
     }
 }
 
-/// Why the ranges of two sessions, or access rules, keep their endpoints apart.
+/// The reason why endpoints of two sessions may not match: discovery ranges or access rules.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum OutOfRange {
     /// One of the sessions is OFF.
@@ -112,7 +112,7 @@ pub enum OutOfRange {
     Unknown,
 }
 
-/// Why endpoints of two sessions on different hosts are not matched; `None` where they may be.
+/// Returns the reason why endpoints of two sessions on different hosts may not match, or `None` if they may.
 pub fn out_of_range(one: RangeToHost, other: RangeToHost) -> Option<OutOfRange> {
     let has = |range| one.range == range || other.range == range;
     if has(DiscoveryRange::Off) {

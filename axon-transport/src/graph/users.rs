@@ -1,13 +1,14 @@
-//! What access rules let other users of this host do.
+//! Access rules for other users of this host.
 //!
-//! The sessions of the daemon's own user are not restricted: a process with that user's rights can do anything to them.
+//! The sessions of the daemon's own user are not restricted, because a process with that user's rights can do
+//! anything to them.
 
 use std::collections::HashMap;
 
 use super::{Endpoint, permits, shows, verb_of};
 use crate::access::{AccessRules, Permissions, Principal};
 
-/// The rules, compiled for each user who has a session, or had one.
+/// The access rules, compiled for each user who has or had a session.
 #[derive(Debug, Default)]
 pub(crate) struct Users {
     rules: AccessRules,
@@ -31,7 +32,7 @@ impl Users {
         self.rules = rules;
     }
 
-    /// Why a user may not have an endpoint, if it may not.
+    /// Returns the reason why a user may not have an endpoint, or `None` if it may.
     pub(crate) fn denial(&self, user: Option<u32>, endpoint: &Endpoint) -> Option<String> {
         let permissions = self.permissions.get(&user?)?;
         if permits(permissions, endpoint) {
@@ -46,7 +47,7 @@ impl Users {
         })
     }
 
-    /// Whether `user` is shown an endpoint of a session of user `of`.
+    /// Returns whether `user` may see an endpoint of a session of user `of`.
     pub(crate) fn shows(&self, user: Option<u32>, of: Option<u32>, endpoint: &Endpoint) -> bool {
         let permissions = user.and_then(|user| self.permissions.get(&user));
         user == of || permissions.is_none_or(|permissions| shows(permissions, endpoint))

@@ -5,7 +5,7 @@ use std::{collections::HashMap, sync::Arc};
 use super::{Endpoint, EndpointRange};
 use crate::ids::{DaemonId, Gid};
 
-/// Every node and endpoint that a session's daemon knows, here and on other hosts.
+/// All nodes and endpoints that a session's daemon knows, on this host and on others.
 #[derive(Clone, Debug, Default)]
 #[non_exhaustive]
 pub struct GraphView {
@@ -21,13 +21,13 @@ pub struct GraphView {
 pub struct GraphEntry {
     /// The endpoint.
     pub endpoint: Arc<Endpoint>,
-    /// The daemon it belongs to when it is on another host.
+    /// The daemon of the endpoint's host; `None` for an endpoint of this host.
     pub daemon: Option<DaemonId>,
-    /// How far its session is discovered: of endpoints of this host, in the gateway's view alone.
+    /// Discovery range of its session. Set only for local endpoints in the gateway's view.
     pub(crate) reach: Option<EndpointRange>,
 }
 
-/// How far the session of an endpoint of this host is discovered, in the gateway's view.
+/// Returns the discovery range of a local endpoint's session. Set only in the gateway's view.
 pub fn reach_of(entry: &GraphEntry) -> Option<&EndpointRange> {
     entry.reach.as_ref()
 }

@@ -275,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn packets_of_a_whole_graph_live_as_long_as_a_session_has_to_be_sent_them() {
+    fn graph_packets_are_freed_after_the_last_session_received_them() {
         let mut whole = WholeGraphs::default();
         let view = GraphFilter::default();
         assert!(whole.get(1, &view).is_none());

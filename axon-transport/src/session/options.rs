@@ -6,7 +6,7 @@ use std::{ffi::OsString, io, path::PathBuf, sync::Arc};
 use crate::sros2::EnclavePermissions;
 use crate::{qos::Qos, session_key::SessionKey, wire::session::SessionRole};
 
-/// How a session is opened.
+/// The options of a new session.
 ///
 /// ```
 /// # use axon_transport::{
@@ -26,16 +26,17 @@ pub struct SessionOptions {
     pub(in crate::session) role: SessionRole,
     pub(in crate::session) daemon_command: Option<DaemonCommand>,
     pub(in crate::session) callers: usize,
-    /// It keeps what the daemon refuses of no endpoint in particular, for the process that it relays.
+    /// True if the session keeps refusals that concern no particular endpoint, for the process that it relays.
     pub(in crate::session) keeps_refusals: bool,
-    /// What its id is made of.
+    /// The key that the session's id is derived from.
     pub(in crate::session) key: Option<Arc<SessionKey>>,
     #[cfg(feature = "sros2")]
     pub(in crate::session) permissions: Option<Arc<EnclavePermissions>>,
 }
 
 impl SessionOptions {
-    /// An application's session. `name` is shown to people; it names the process or node.
+    /// Creates the options of an application's session. `name` is shown to users and identifies the process or node.
+    /// It is truncated to 256 bytes.
     pub fn new(name: impl Into<String>) -> Self {
         let mut name: String = name.into();
         while name.len() > 256 {
@@ -54,8 +55,9 @@ impl SessionOptions {
         }
     }
 
-    /// Limits the session to what an enclave may do: it creates no endpoint that these permissions do not allow. The graph
-    /// shows all the same. Those that exist when the permissions run out stay, and no other one is created.
+    /// Limits the session to the permissions of an enclave. The session creates no endpoint that they do not allow.
+    /// The graph still shows all endpoints. When the permissions expire, existing endpoints stay, and no other one is
+    /// created.
     #[cfg(feature = "sros2")]
     #[must_use]
     pub fn permissions(mut self, permissions: EnclavePermissions) -> Self {
@@ -63,7 +65,7 @@ impl SessionOptions {
         self
     }
 
-    /// How to start a daemon, for a program that can be one itself. `AXON_DAEMON_PATH` wins.
+    /// Sets the command that starts a daemon, for a program that can itself be one. `AXON_DAEMON_PATH` wins.
     #[must_use]
     pub fn daemon_command(mut self, command: DaemonCommand) -> Self {
         self.daemon_command = Some(command);
@@ -71,8 +73,8 @@ impl SessionOptions {
     }
 }
 
-/// A command that runs a daemon: it passes the flags `--spawned` and `--detached`, which are added
-/// after the arguments, on to `axon_daemon::Start::from_arguments`.
+/// A command that runs a daemon. The flags `--spawned` and `--detached` are added after the arguments. The program
+/// passes them on to `axon_daemon::Start::from_arguments`.
 ///
 /// ```
 /// use axon_transport::{DaemonCommand, SessionOptions};
@@ -86,12 +88,12 @@ impl SessionOptions {
 pub struct DaemonCommand {
     /// The program.
     pub program: PathBuf,
-    /// The arguments before the flag.
+    /// The arguments before the flags.
     pub arguments: Vec<OsString>,
 }
 
 impl DaemonCommand {
-    /// A program, and the arguments before the flag.
+    /// Creates a command from a program and the arguments before the flags.
     pub fn new(
         program: impl Into<PathBuf>,
         arguments: impl IntoIterator<Item = impl Into<OsString>>,
@@ -100,10 +102,10 @@ impl DaemonCommand {
         Self { program: program.into(), arguments }
     }
 
-    /// This very program, with arguments that make it the daemon.
+    /// Creates a command from the current executable and the arguments that make it the daemon.
     ///
     /// # Errors
-    /// When the system does not say which program this is.
+    /// The system does not report the path of the executable.
     pub fn current_executable(
         arguments: impl IntoIterator<Item = impl Into<OsString>>,
     ) -> io::Result<Self> {
@@ -111,7 +113,7 @@ impl DaemonCommand {
     }
 }
 
-/// What an endpoint is.
+/// The description of an endpoint.
 ///
 /// ```
 /// use axon_transport::{EndpointSpec, qos::Qos};
@@ -128,23 +130,23 @@ pub struct EndpointSpec {
     pub topic: String,
     /// The type's name. Endpoints match on topic and type.
     pub type_name: String,
-    /// The type's hash; empty when unknown.
+    /// The type's hash; empty if unknown.
     pub type_hash: Vec<u8>,
-    /// What the endpoint offers or requests.
+    /// QoS that is offered or requested.
     pub qos: Qos,
-    /// The node it belongs to; may be empty.
+    /// The node's name; empty without a node.
     pub node: String,
-    /// That node's namespace.
+    /// The node's namespace.
     pub namespace: String,
-    /// A subscription: whether it receives nothing from publishers of its own session.
+    /// For a subscription: true if it ignores publishers of its own session.
     pub ignore_local: bool,
-    /// A publisher: the length of most samples in bytes, as in
-    /// [`PublisherOptions::expected_len`](axon_shm::PublisherOptions::expected_len); 0 when unknown.
+    /// For a publisher: the length of most samples in bytes, as in
+    /// [`PublisherOptions::expected_len`](axon_shm::PublisherOptions::expected_len); 0 if unknown.
     pub expected_len: u64,
 }
 
 impl EndpointSpec {
-    /// An endpoint of no node, of a type without a known hash.
+    /// Creates an endpoint without a node and without a hash of its type.
     pub fn new(topic: impl Into<String>, type_name: impl Into<String>, qos: Qos) -> Self {
         Self {
             topic: topic.into(),
@@ -158,49 +160,49 @@ impl EndpointSpec {
         }
     }
 
-    /// Of another topic.
+    /// Sets the topic.
     #[must_use]
     pub fn topic(mut self, topic: impl Into<String>) -> Self {
         self.topic = topic.into();
         self
     }
 
-    /// Of another type.
+    /// Sets the type.
     #[must_use]
     pub fn type_name(mut self, type_name: impl Into<String>) -> Self {
         self.type_name = type_name.into();
         self
     }
 
-    /// Of a type with this hash.
+    /// Sets the hash of the type.
     #[must_use]
     pub fn type_hash(mut self, hash: impl Into<Vec<u8>>) -> Self {
         self.type_hash = hash.into();
         self
     }
 
-    /// Offers or requests this.
+    /// Sets the QoS that is offered or requested.
     #[must_use]
     pub fn qos(mut self, qos: Qos) -> Self {
         self.qos = qos;
         self
     }
 
-    /// Of this node.
+    /// Sets the node and its namespace.
     #[must_use]
     pub fn node(mut self, name: impl Into<String>, namespace: impl Into<String>) -> Self {
         (self.node, self.namespace) = (name.into(), namespace.into());
         self
     }
 
-    /// A subscription: whether it receives nothing from publishers of its own session.
+    /// Sets whether a subscription ignores publishers of its own session.
     #[must_use]
     pub fn ignore_local(mut self, whether: bool) -> Self {
         self.ignore_local = whether;
         self
     }
 
-    /// A publisher: the length of most samples in bytes.
+    /// Sets the length of most samples of a publisher, in bytes.
     #[must_use]
     pub fn expected_len(mut self, len: u64) -> Self {
         self.expected_len = len;

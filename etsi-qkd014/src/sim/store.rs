@@ -328,7 +328,7 @@ mod tests {
     }
 
     #[test]
-    fn a_store_that_is_set_back_gives_the_same_keys_again_to_the_same_saes() {
+    fn restored_store_delivers_the_same_keys_to_the_same_saes() {
         let mut store = Store::new(FillRate::Unlimited, 10, 10);
         let draw = |store: &mut Store, slave: &str| {
             store.draw(&link(0, 1), 2, 32, 2, "m", &slaves(&[slave])).unwrap()

@@ -168,7 +168,7 @@ async fn a_private_key_may_come_through_a_pipe_and_an_endless_file_is_refused() 
 }
 
 #[tokio::test]
-async fn clients_of_no_runtime_fail_where_they_are_made_or_work_where_they_are_used() {
+async fn clients_without_a_runtime_fail_when_made_or_work_when_used() {
     // Made outside of any runtime, used inside of one.
     let network = network().await;
     let settings = network.client_builder("sae-a");

@@ -246,7 +246,7 @@ fn events(matched: &Event, incompatible: &Event) -> (u64, u64) {
 }
 
 #[test]
-fn an_endpoint_that_the_other_host_denies_is_never_matched_and_seen_all_the_same() {
+fn denied_remote_endpoint_is_visible_and_never_matched() {
     use EventKind::{
         OfferedQosIncompatible, PublicationMatched, RequestedQosIncompatible, SubscriptionMatched,
     };

@@ -165,7 +165,7 @@ fn both_sides_say_that_they_are_done_before_a_superseded_link_is_closed() {
 }
 
 #[test]
-fn a_route_whose_end_was_lost_with_a_link_ends_or_gives_way_to_its_successor() {
+fn lost_end_of_a_route_is_made_up_by_the_next_link() {
     let elector = Elector::new();
     let session = elector.host.session("talker");
     let publisher =

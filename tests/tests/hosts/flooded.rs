@@ -55,7 +55,7 @@ fn refused_handshakes_leave_few_lines_in_the_log() {
 }
 
 #[test]
-fn a_flood_of_strangers_hides_no_refused_session_and_no_claim_of_a_pinned_peer() {
+fn flood_of_unknown_peers_hides_no_other_refusal() {
     let camera = Camera::new();
     let host = &camera.a;
     let mut link = camera.link(0xff);

@@ -198,7 +198,7 @@ fn serves_others(camera: &Camera, there: &mut Node, load: impl FnOnce()) {
 }
 
 #[test]
-fn a_graph_has_a_bound_for_all_daemon_ids_of_a_peer_and_the_rest_of_the_link_goes_on() {
+fn graph_is_bounded_for_all_daemon_ids_of_a_peer_and_the_link_stays() {
     let camera = Camera::new();
     let witness = camera.a.session("witness");
     let mut there = camera.a.subscribe(Sizes::Small);
@@ -371,7 +371,7 @@ fn graph_change_floods_block_no_session_and_end_in_the_newest_state() {
 }
 
 #[test]
-fn routes_that_take_more_than_a_peer_may_are_refused_by_name_and_the_others_served() {
+fn routes_beyond_the_limit_of_a_peer_are_refused_by_name() {
     let camera = Camera::new();
     let mut link = camera.link(0xff);
     let qos = Qos::default();

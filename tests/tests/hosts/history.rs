@@ -53,7 +53,7 @@ fn a_late_joiner_gets_twenty_thousand_small_samples_on_each_host() {
 }
 
 #[test]
-fn history_that_was_written_over_many_times_is_the_newest_of_as_many_bytes_as_are_set() {
+fn history_is_bounded_by_bytes_and_keeps_the_newest() {
     // A sample of 64 bytes takes 128.
     const KEPT: u64 = (2 << 20) / 128;
     const SAMPLES: u64 = 10 * KEPT + 12_345;

@@ -96,7 +96,7 @@ const SHORT_IDS: u8 = 6;
 const PUBLISHERS: u32 = 1024;
 
 #[test]
-fn short_messages_that_do_not_come_whole_are_bounded_over_all_ids_of_a_peer_and_given_back() {
+fn incomplete_short_messages_are_bounded_for_a_peer_and_freed() {
     const SAYS: u32 = 32 << 10;
     let camera = Camera::new();
     let session = camera.a.session("slow");
@@ -222,7 +222,7 @@ fn history_that_is_delivered_is_bounded_for_a_peer_and_its_newest_is_kept() {
 }
 
 #[test]
-fn requests_that_a_server_does_not_take_are_bounded_for_a_peer_and_none_is_lost() {
+fn untaken_requests_are_bounded_for_a_peer_without_loss() {
     let ([a, b], before) = bounded();
     let here = a.session("servers");
     let service = |name: &str| EndpointSpec::new(name.to_owned(), "test/Set", Qos::keep_all());

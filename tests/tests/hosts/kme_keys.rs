@@ -73,7 +73,7 @@ fn search(kmes: &Kmes, host: &Host) -> Vec<Find> {
 }
 
 #[test]
-fn secrets_of_the_connection_to_the_kme_are_on_no_stack_and_nowhere_after_its_end() {
+fn secrets_of_the_kme_connection_are_erased() {
     if !may_search() {
         return;
     }

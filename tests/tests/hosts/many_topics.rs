@@ -56,7 +56,7 @@ fn small_hosts() -> [Host; 2] {
 }
 
 #[test]
-fn a_peer_that_asks_for_too_many_routes_is_refused_those_by_name_and_keeps_its_link() {
+fn excess_routes_of_a_peer_are_refused_by_name_and_its_link_stays() {
     let [host, _other] = small_hosts();
     let (stranger, auth) = (Stranger::new(), Auth::None(SigningKey::generate().unwrap()));
     let claim = Claim { host: "greedy", daemon: DaemonId([0xff; 16]), auth: 0 };
@@ -219,7 +219,7 @@ fn a_refused_route_is_shown_at_the_subscription_and_at_the_publisher_that_wait()
 }
 
 #[test]
-fn kinds_of_subscriptions_for_which_a_topic_has_no_relay_are_told_to_both_hosts() {
+fn subscriptions_without_a_relay_are_reported_on_both_hosts() {
     const TOPIC: &str = "/kinds";
     let hosts = Plan::new([classic(&[]), classic(&[])]).start();
     let (here, there) = (hosts[0].session("publisher"), hosts[1].session("subscriptions"));

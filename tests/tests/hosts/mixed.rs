@@ -99,7 +99,7 @@ fn a_reliable_subscription_gets_all_that_a_best_effort_one_before_it_may_miss() 
 }
 
 #[test]
-fn one_that_keeps_all_holds_a_publisher_back_though_one_that_does_not_was_there_first() {
+fn keep_all_reader_holds_a_publisher_back_beside_an_earlier_keep_last_reader() {
     let hosts = hosts();
     let topic = "/dropping_first";
     let (publisher, there, _first) = crossing(&hosts, topic, Qos::default());

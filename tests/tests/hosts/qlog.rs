@@ -56,7 +56,7 @@ fn each_side_of_a_link_writes_its_events_and_no_payload() {
 }
 
 #[test]
-fn a_directory_that_cannot_be_made_costs_one_line_of_the_log_and_nothing_else() {
+fn unusable_qlog_directory_is_logged_once_and_changes_nothing() {
     // There is no directory below a file.
     let hosts = hosts(|host| host.join("host.txt/qlog"));
     for host in &hosts {

@@ -116,7 +116,7 @@ fn a_pinned_peer_that_announces_gids_later_takes_nothing_away() {
 }
 
 #[test]
-fn a_proof_of_another_connection_or_daemon_is_worth_nothing_and_one_of_its_own_counts() {
+fn proof_of_another_connection_or_daemon_is_refused() {
     let camera = Camera::new();
     let witness = camera.a.session("witness");
     let key = SessionKey::generate().unwrap();

@@ -66,7 +66,7 @@ fn retry(message: LinkMessage) -> u32 {
 }
 
 #[test]
-fn a_peer_that_reads_nothing_is_disconnected_from_the_topic_and_the_publisher_goes_on() {
+fn peer_that_reads_nothing_is_cut_from_the_topic() {
     let [host, _other] = Plan { stalled_s: 3, ..Plan::new([classic(&[]), classic(&[])]) }.start();
     let session = host.session("publisher");
     let spec = || EndpointSpec::new(TOPIC, TYPE, Qos::keep_all());
@@ -111,7 +111,7 @@ fn a_peer_that_reads_nothing_is_disconnected_from_the_topic_and_the_publisher_go
 }
 
 #[test]
-fn a_peer_that_claims_to_have_dropped_more_than_it_got_makes_up_no_losses() {
+fn exaggerated_drop_report_of_a_peer_counts_no_loss() {
     let [host, _other] = Plan::new([classic(&[]), classic(&[])]).start();
     claims_to_have_dropped(&host, &host.session("publisher"));
 }
@@ -253,7 +253,7 @@ fn at_service(host: &Host, kind: EndpointKind, idler: Idler) -> (Stranger, Met) 
 }
 
 #[test]
-fn a_peer_whose_server_takes_no_request_holds_up_no_client_of_another_server_for_long() {
+fn stalled_server_holds_up_no_client_of_another_server_for_long() {
     let [host, _other] = Plan { stalled_s: 3, ..Plan::new([classic(&[]), classic(&[])]) }.start();
     let client = host.session("client").create_client(service()).unwrap();
     let server = host.session("server").create_server(service()).unwrap();
@@ -306,7 +306,7 @@ fn a_peer_that_never_asks_for_responses_holds_up_no_server_for_long() {
 }
 
 #[test]
-fn a_peer_that_asks_again_and_again_for_responses_holds_up_no_server_for_long() {
+fn repeated_asking_for_responses_holds_up_no_server_for_long() {
     takes_no_response(Idler::AsksAgain);
 }
 

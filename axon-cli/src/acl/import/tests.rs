@@ -44,7 +44,7 @@ fn may(text: &str, verb: Verb, name: &str) -> bool {
 }
 
 #[test]
-fn both_halves_of_a_service_are_a_call_or_a_server_and_one_is_neither() {
+fn request_and_response_topics_together_become_a_service_rule() {
     let allow = rule(
         "allow",
         &["rq/addRequest", "rr/homeReply", "rq/half/Request"],

@@ -1,5 +1,5 @@
-//! Makes the peers of this daemon. They share its memory for samples, the numbers of its responses, and what is
-//! compressed.
+//! Creates the peers of this daemon. They share its memory for samples, its response numbers, and its compressed
+//! samples.
 
 use std::{rc::Rc, sync::Arc, time::Duration};
 
@@ -17,12 +17,12 @@ use super::{
 };
 use crate::owner::{ChannelBinding, SessionKeys};
 
-/// What all peers have in common.
+/// The state that all peers share.
 pub(super) struct PeerFactory {
     config: Arc<Config>,
     daemon: DaemonId,
     session_keys: Arc<SessionKeys>,
-    /// CLOCK_MONOTONIC, in nanoseconds, when the engine's time was zero.
+    /// CLOCK_MONOTONIC in nanoseconds at the engine's time zero.
     epoch_nanos: u64,
     budget: Rc<Budget>,
     responses: ResponseNumbers,
@@ -34,20 +34,20 @@ pub(super) struct FirstLink {
     pub(super) number: u64,
     /// The peer's daemon.
     pub(super) daemon: DaemonId,
-    /// Who the peer proved to be.
+    /// The identity that the peer proved.
     pub(super) identity: String,
     pub(super) account: Rc<Account>,
-    /// What access rules let the peer do.
+    /// The peer's rights by the access rules.
     pub(super) permissions: Permissions,
     pub(super) binding: Option<ChannelBinding>,
-    /// Routes that the peer's HELLO says it serves at most.
+    /// Most routes that the peer serves, as its HELLO states.
     pub(super) routes: Option<u32>,
-    /// Whether sessions prove that they are of their host.
+    /// True if sessions prove that they belong to their host.
     pub(super) needs_proofs: bool,
 }
 
 impl PeerFactory {
-    /// Makes the peers of `daemon`, this host's.
+    /// Creates the factory of the peers of `daemon`, which is this host's daemon.
     pub(super) fn new(
         config: Arc<Config>,
         daemon: DaemonId,
@@ -59,7 +59,7 @@ impl PeerFactory {
         Self { config, daemon, session_keys, epoch_nanos, budget, responses, compression }
     }
 
-    /// A peer with this link, whose graph is not known yet.
+    /// Creates a peer with this link and without a graph.
     pub(super) fn make(&self, link: FirstLink, now: Duration) -> Peer {
         let FirstLink {
             number,
@@ -100,12 +100,12 @@ impl PeerFactory {
         })
     }
 
-    /// What is compressed for all peers.
+    /// Returns the compression that all peers share.
     pub(super) fn compression(&self) -> &Compression {
         &self.compression
     }
 
-    /// Samples that wait for all peers, in bytes, and how many bytes have left their queues since the start.
+    /// Returns the bytes of samples that wait for all peers, and the bytes that have left their queues since the start.
     pub(super) fn backlog(&self) -> (usize, usize) {
         (self.budget.taken(), self.budget.released())
     }
@@ -137,7 +137,7 @@ mod tests {
         let (one, two) = (make(2), make(3));
         assert_eq!((one.link, two.link), (2, 3));
         assert!(!Rc::ptr_eq(&one.counters, &two.counters));
-        // The share of each peer refers to the whole.
+        // The share of each peer holds a reference to the whole.
         assert_eq!(Rc::strong_count(&factory.budget), 3);
         factory.budget.overtake(100);
         factory.budget.release(30);

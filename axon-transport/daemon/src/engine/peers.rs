@@ -1,4 +1,4 @@
-//! The peers with an elected link, and what all of them use.
+//! The peers with an elected link, and the state that all of them use.
 
 use std::{
     cell::RefCell,
@@ -20,8 +20,8 @@ use super::{
     stand_in::StandIns,
 };
 
-/// What following a change of this host's graph costs for each endpoint of both graphs, as an estimate: samples have
-/// nine times as long before the next one.
+/// Estimated cost of an update after a change of this host's graph, for each endpoint of both graphs. Samples get nine
+/// times this cost as time before the next update.
 const ENDPOINT: Duration = Duration::from_nanos(500);
 const OTHERS: u32 = 9;
 const LONGEST_PAUSE: Duration = Duration::from_millis(200);
@@ -37,14 +37,14 @@ pub(super) struct LinkedPeers {
     local: LocalEndpoints,
     writers: LocalWriterCounts,
     waiting_for_room: bool,
-    /// Readers with samples to take; kept for its memory.
+    /// Readers with samples to take; the vector is kept for its memory.
     active: Vec<(Gid, Gid)>,
-    /// When the graph of this host is followed again.
+    /// The time of the next update after changes of this host's graph.
     follow_local_at: Duration,
 }
 
 impl LinkedPeers {
-    /// No peers yet, and nothing on this host.
+    /// Creates the collection without peers and without endpoints of this host.
     pub(super) fn new(config: Arc<Config>, rings: Rc<dyn Rings>) -> Self {
         Self {
             all: HashMap::new(),
@@ -61,7 +61,7 @@ impl LinkedPeers {
         }
     }
 
-    /// The endpoints of this host.
+    /// Returns the endpoints of this host.
     pub(super) fn local(&self) -> &LocalEndpoints {
         &self.local
     }
@@ -76,45 +76,45 @@ impl LinkedPeers {
         self.all.remove(&daemon)
     }
 
-    /// Whether there are none.
+    /// Returns whether there are no peers.
     pub(super) fn is_empty(&self) -> bool {
         self.all.is_empty()
     }
 
-    /// A peer.
+    /// Returns a peer.
     pub(super) fn get(&self, daemon: DaemonId) -> Option<&Peer> {
         self.all.get(&daemon)
     }
 
-    /// A peer.
+    /// Returns a peer.
     pub(super) fn get_mut(&mut self, daemon: DaemonId) -> Option<&mut Peer> {
         self.all.get_mut(&daemon)
     }
 
-    /// All peers.
+    /// Returns all peers.
     pub(super) fn iter(&self) -> impl Iterator<Item = (DaemonId, &Peer)> {
         self.all.iter().map(|(daemon, peer)| (*daemon, peer))
     }
 
-    /// All peers.
+    /// Returns all peers.
     pub(super) fn iter_mut(&mut self) -> impl Iterator<Item = (DaemonId, &mut Peer)> {
         self.all.iter_mut().map(|(daemon, peer)| (*daemon, peer))
     }
 
-    /// All peers.
+    /// Returns all peers.
     pub(super) fn values_mut(&mut self) -> hash_map::ValuesMut<'_, DaemonId, Peer> {
         self.all.values_mut()
     }
 
-    /// Replaces `[[topic]]`. A rate counts once the limits of a peer are [renewed](Peer::set_permissions), and a priority
-    /// for routes that are served from now on.
+    /// Replaces `[[topic]]`. A rate applies once the limits of a peer are [renewed](Peer::set_permissions), and a
+    /// priority applies to routes that are served from now on.
     pub(super) fn set_topics(&mut self, topics: Vec<TopicRule>) {
         if self.config.topics != topics {
             Arc::make_mut(&mut self.config).topics = topics;
         }
     }
 
-    /// Has a peer act with what all peers use.
+    /// Calls `act` with a peer and the state that all peers use. Returns `None` if there is no such peer.
     pub(super) fn with<T>(
         &mut self,
         daemon: DaemonId,
@@ -125,14 +125,14 @@ impl LinkedPeers {
         all.get_mut(&daemon).map(|peer| act(peer, &with))
     }
 
-    /// Has each peer act with what all peers use.
+    /// Calls `each` with each peer and the state that all peers use.
     pub(super) fn with_each(&mut self, mut each: impl FnMut(&mut Peer, &PeerContext<'_>)) {
         let Self { all, config, rings, stand_ins, stalls, kept, local, writers, .. } = self;
         let with = peer_context(config, &**rings, stand_ins, (stalls, kept), (local, writers));
         all.values_mut().for_each(|peer| each(peer, &with));
     }
 
-    /// The graph of this host changed.
+    /// Handles a change of this host's graph.
     pub(super) fn handle_local_graph(&mut self, now: Duration, local: LocalEndpoints) {
         self.writers = LocalWriterCounts::of(local.values().map(|(endpoint, _)| &**endpoint));
         self.local = local;
@@ -142,12 +142,13 @@ impl LinkedPeers {
         self.with_each(|peer, with| peer.handle_local_graph(now, with));
     }
 
-    /// When the graph of this host should be followed next. What changes until then is followed together.
+    /// Returns when the peers should next be updated to the graph of this host. All changes until then are handled
+    /// together.
     pub(super) fn follow_local_at(&self) -> Duration {
         self.follow_local_at
     }
 
-    /// Samples wait in rings, or readers made room in them.
+    /// Handles samples that wait in rings, and room that readers made in them.
     pub(super) fn handle_rings(&mut self, now: Duration) {
         let mut active = std::mem::take(&mut self.active);
         self.rings.take_active(&mut active);
@@ -159,7 +160,7 @@ impl LinkedPeers {
         self.active = active;
     }
 
-    /// Has the rings say when there is room, while a peer waits for it.
+    /// Asks the rings to report room while a peer waits for it.
     pub(super) fn wait_for_room(&mut self) {
         let waiting = self.all.values().any(|peer| peer.inbound.waits_for_room());
         if waiting || self.waiting_for_room {
@@ -173,23 +174,23 @@ impl LinkedPeers {
         peer.keep_relays(&mut self.kept.borrow_mut(), now);
     }
 
-    /// Relays that are kept.
+    /// Returns the number of kept relays.
     #[cfg(test)]
     pub(super) fn kept(&self) -> usize {
         self.kept.borrow().len()
     }
 
-    /// Gives up what relays hold that were kept until now. Returns the samples, by topic.
+    /// Gives up the samples of kept relays whose time is over. Returns the samples, by topic.
     pub(super) fn give_up_relays(&mut self, now: Duration) -> Vec<(String, u64)> {
         self.kept.borrow_mut().give_up(now)
     }
 
-    /// Whether samples of publishers that ended are on their way.
+    /// Returns whether samples of ended publishers are still being sent.
     pub(super) fn are_draining(&self) -> bool {
         self.all.values().any(Peer::is_draining)
     }
 
-    /// When one of them has something due.
+    /// Returns when a peer or a kept relay has work due.
     pub(super) fn poll_timeout(&self, now: Duration) -> Option<Duration> {
         let due = self.all.values().flat_map(|peer| {
             let turn = peer.stirred.then(|| {
@@ -203,7 +204,7 @@ impl LinkedPeers {
         due.flatten().chain(self.kept.borrow().poll_timeout()).min()
     }
 
-    /// Does what is due, but for samples to peers, which needs their links.
+    /// Does the work that is due, except for samples to peers, which need their links.
     pub(super) fn handle_timeout(&mut self, now: Duration) {
         self.with_each(|peer, with| {
             peer.inbound.handle_timeout(now);

@@ -1,4 +1,4 @@
-//! The order in which samples leave: the priority of the topic first, and within a priority the class.
+//! The order in which samples are sent: first by the priority of the topic, then by class.
 
 use axon_transport::config::TopicPriority;
 
@@ -13,7 +13,7 @@ pub(in crate::engine) const RANKS: usize = 3 * CLASSES;
 /// Distance of two topic priorities in the priorities of QUIC's streams. It leaves space below each class.
 const PRIORITY: i32 = 8;
 
-/// The class of a flow's next sample. Control messages go before all classes: QUIC itself sends their stream first.
+/// The class of a flow's next sample. Control messages go before all classes: QUIC sends their stream first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Class {
     /// Requests and responses of services and actions.
@@ -75,12 +75,12 @@ impl Priorities {
         self.0[priority as usize] += 1;
     }
 
-    /// Counts a route of this priority less.
+    /// Removes a route of this priority from the count.
     pub(in crate::engine) fn remove(&mut self, priority: TopicPriority) {
         self.0[priority as usize] -= 1;
     }
 
-    /// Returns how many priorities below this one have routes.
+    /// Returns the number of priorities below this one that have routes.
     pub(crate) fn below(&self, priority: TopicPriority) -> u64 {
         self.0[..priority as usize].iter().filter(|routes| **routes > 0).count() as u64
     }

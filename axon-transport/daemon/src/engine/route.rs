@@ -6,10 +6,10 @@ use axon_envelope::Kind;
 use axon_shm::{ids::Gid, qos::Qos};
 use axon_transport::graph::{Endpoint, EndpointKind};
 
-/// What a route carries: samples, requests or responses, of one name and type.
+/// The key of a route: kind, topic and type of the messages that it carries.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(crate) struct RouteKey {
-    /// Which of the three.
+    /// Samples, requests or responses.
     pub(crate) kind: Kind,
     /// Topic or service name.
     pub(crate) topic: String,
@@ -29,7 +29,7 @@ impl fmt::Display for RouteKey {
 }
 
 impl RouteKey {
-    /// The key of what `writer` writes; `None` where it writes nothing.
+    /// Returns the key of a writer's route, or `None` for a reader or a node.
     pub(in crate::engine) fn of(writer: &Endpoint) -> Option<Self> {
         let kind = match writer.kind {
             EndpointKind::Publisher => Kind::Topic,
@@ -41,12 +41,12 @@ impl RouteKey {
         Some(Self { kind, topic, type_name })
     }
 
-    /// Bytes of its names.
+    /// Returns the length of both names in bytes.
     pub(crate) fn bytes(&self) -> usize {
         self.topic.len() + self.type_name.len()
     }
 
-    /// The key of the same service in the other direction; of a topic its own.
+    /// Returns the key of the same service in the other direction; for a topic its own key.
     pub(crate) fn other_way(&self) -> Self {
         let kind = match self.kind {
             Kind::Topic => Kind::Topic,
@@ -60,23 +60,23 @@ impl RouteKey {
 /// One relay subscription that the sending side opens for a topic's route.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct RelaySpec {
-    /// What it requests locally.
+    /// The QoS that it requests locally.
     pub(crate) qos: Qos,
-    /// How many samples the deepest of those it stands for wants to wait at most.
+    /// Largest history depth among the subscriptions that it stands for.
     pub(crate) depth: u32,
-    /// The hash of its type, where the peer's subscriptions know it.
+    /// The hash of its type, if the peer's subscriptions know it.
     pub(crate) type_hash: Vec<u8>,
     /// The peer's subscriptions that it stands for.
     pub(crate) stands_for: Vec<Gid>,
 }
 
 impl RelaySpec {
-    /// Whether it is the relay that `other` is, for the same subscriptions or for others.
+    /// Returns whether both have the same QoS and type hash. The subscriptions may differ.
     pub(crate) fn is(&self, other: &Self) -> bool {
         self.qos == other.qos && self.type_hash == other.type_hash
     }
 
-    /// How what it sends is queued.
+    /// Returns the QoS of its queue.
     pub(crate) fn queued(&self) -> Qos {
         self.qos.with_depth(self.depth)
     }

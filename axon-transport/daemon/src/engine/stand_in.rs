@@ -27,7 +27,7 @@ use crate::engine::account::{Account, Charge};
 pub(crate) struct StandIn {
     ring: Rc<dyn RingWriter>,
     gid: Gid,
-    /// Whether sequence numbers rise, as those of samples and requests do. A server answers calls in any
+    /// True if sequence numbers rise, as those of samples and requests do. A server answers calls in any
     /// order.
     rises: bool,
     /// The last written sequence number; 0 if there is none.
@@ -92,7 +92,7 @@ impl StandIn {
         }
     }
 
-    /// Returns what became of a sample that may have been dropped here before. A publisher whose link broke
+    /// Returns the earlier fate of a sample, which may have been dropped here before. A publisher whose link broke
     /// sends such a sample again.
     pub(crate) fn dropped(&self, sequence: u64) -> EarlierFate {
         self.dropped.borrow().find(sequence)
@@ -105,10 +105,10 @@ impl fmt::Debug for StandIn {
     }
 }
 
-/// Why there is no stand-in for an endpoint.
+/// The reason for which an endpoint has no stand-in.
 #[derive(Debug)]
 pub(crate) enum NoStandIn {
-    /// The identity that announced the endpoint has as many stand-ins as it may.
+    /// The identity that announced the endpoint has as many stand-ins as its limit permits.
     TooMany,
     /// The stand-in could not be created for this reason.
     Failed(String),
@@ -127,11 +127,11 @@ struct Known {
 #[derive(Default)]
 pub(crate) struct StandIns {
     known: RefCell<HashMap<Gid, Known>>,
-    /// The number of known entries at which those of gone stand-ins are forgotten.
+    /// The number of known entries at which the entries of gone stand-ins are forgotten.
     clean_at: Cell<usize>,
 }
 
-/// The lowest number of known entries at which those of gone stand-ins are forgotten.
+/// The lowest number of known entries at which the entries of gone stand-ins are forgotten.
 const KNOWN: usize = 64;
 /// The most gone publishers whose numbers are remembered, so that a publisher that returns continues from its
 /// number. Beyond that, each identity keeps its newest entries up to an equal share.

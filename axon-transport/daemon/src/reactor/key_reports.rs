@@ -38,7 +38,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn no_report_is_asked_for_while_one_is_under_way_and_one_a_second_otherwise() {
+    fn reports_of_keys_are_requested_once_a_second_one_at_a_time() {
         let mut reports = KeyReports::default();
         assert!(reports.begin(Duration::ZERO));
         let later = Duration::from_secs(60);

@@ -42,7 +42,7 @@ fn bind_name(address: &str) -> OwnedFd {
 }
 
 #[test]
-fn a_bound_name_is_an_error_that_says_so_where_there_is_no_runtime_directory() {
+fn bound_abstract_name_without_a_runtime_directory_is_reported() {
     let host = counting(host("183"));
     let _squatter = squat(&host);
     let said = host.play("idle").hear();
@@ -52,7 +52,7 @@ fn a_bound_name_is_an_error_that_says_so_where_there_is_no_runtime_directory() {
 }
 
 #[test]
-fn a_name_at_which_another_user_listens_is_an_error_that_says_whose_it_is() {
+fn abstract_name_of_another_user_is_an_error_with_the_owner() {
     const NOBODY: u32 = 65534;
     if !rustix::process::geteuid().is_root() {
         return skip::skip("only root can be two users");
@@ -122,7 +122,7 @@ fn a_runtime_directory_of_another_user_is_left_alone() {
 }
 
 #[test]
-fn a_named_runtime_directory_of_another_user_is_an_error_that_says_whose_it_is() {
+fn runtime_directory_of_another_user_is_an_error_with_the_owner() {
     if !rustix::process::geteuid().is_root() {
         return skip::skip("only root can be two users");
     }

@@ -40,7 +40,7 @@ fn assert_ruled(status: &Status) {
 }
 
 #[test]
-fn a_daemon_that_takes_the_place_of_a_killed_one_has_the_rules_of_the_host() {
+fn successor_of_a_killed_daemon_has_the_rules_of_the_host() {
     let host = Host::new();
     if !can_have_rules(&host) {
         return;

@@ -78,7 +78,7 @@ pub(crate) fn server() {
 }
 
 #[test]
-fn a_client_gets_the_response_that_a_server_sent_after_the_daemon_was_killed_and_before_it_ended() {
+fn response_sent_between_the_kill_of_the_daemon_and_the_end_of_the_server_arrives() {
     let host = Host::new();
     let mut server = host.play("leaves a response");
     let session = Session::open(&host.config(), SessionOptions::new("client")).unwrap();

@@ -67,7 +67,7 @@ fn unusable_files(dir: &Path) -> [Unusable; 3] {
 }
 
 #[test]
-fn a_file_that_cannot_be_used_ends_a_daemon_with_status_2_before_it_makes_anything() {
+fn unusable_file_ends_a_daemon_with_status_2_and_no_traces() {
     let dir = tempfile::tempdir().unwrap();
     for (settings, variable, file) in unusable_files(dir.path()) {
         let host = settings.iter().fold(Host::new(), |host, (name, value)| host.with(name, value));
@@ -132,7 +132,7 @@ pub(crate) fn streamless() {
 }
 
 #[test]
-fn without_a_program_to_start_the_error_says_where_it_was_looked_for_and_how_it_is_installed() {
+fn missing_daemon_program_is_an_error_with_its_paths_and_remedy() {
     let host = Host::new().without("AXON_DAEMON_PATH");
     let [path, home] = ["bin", "home"].map(|name| host.dir.path().join(name));
     let beside = std::env::current_exe().unwrap().parent().unwrap().to_path_buf();

@@ -155,7 +155,7 @@ fn a_daemon_in_the_background_starts_though_the_file_system_of_its_log_is_full()
 }
 
 #[test]
-fn a_daemon_that_may_not_write_at_all_ends_with_an_error_and_not_by_a_signal() {
+fn daemon_that_may_not_write_ends_with_an_error_and_not_by_a_signal() {
     let host = Host::new();
     // The limit is one of files, not of pipes.
     let (mut reader, writer) = std::io::pipe().unwrap();

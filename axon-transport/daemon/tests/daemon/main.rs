@@ -315,7 +315,7 @@ fn require_without_a_daemon_fails_and_off_needs_none() {
 }
 
 #[test]
-fn domains_that_share_a_runtime_directory_have_a_daemon_each_and_nothing_else_in_common() {
+fn domains_in_one_runtime_directory_have_separate_daemons() {
     let one = Host::new();
     let run = one.dir.path().join("run").to_str().unwrap().to_owned();
     let other = Host::new().with("AXON_RUNTIME_DIR", &run).with("ROS_DOMAIN_ID", "1");

@@ -55,7 +55,7 @@ fn a_reader_stopped_during_its_attachment_blocks_no_other_reader() {
 }
 
 #[test]
-fn a_daemon_killed_in_the_middle_of_attachments_is_followed_by_one_that_completes_them() {
+fn successor_completes_the_attachments_of_a_killed_daemon() {
     let host = Host::new();
     // The first of them starts the daemon, and so do those that follow.
     let mut idle = host.play("listener");

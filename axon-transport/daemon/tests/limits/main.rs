@@ -166,7 +166,7 @@ fn memory_that_a_subscriber_had_no_descriptor_for_comes_when_it_has_one() {
 }
 
 #[test]
-fn a_session_with_more_memory_than_the_daemon_can_hold_is_told_once_and_stays() {
+fn session_with_too_much_memory_is_told_once_and_stays() {
     let host = Host::new();
     let daemon = host.daemon();
     // The session asks for 150, and gets half of what is left.
@@ -226,7 +226,7 @@ fn a_publisher_at_the_limit_of_its_control_group_is_refused_and_not_killed() {
 }
 
 #[test]
-fn a_process_that_becomes_another_program_is_gone_but_for_the_samples_that_it_read() {
+fn exec_releases_all_but_the_read_samples() {
     let host = Host::new();
     let _daemon = host.daemon();
     let session = host.session("camera").unwrap();

@@ -112,7 +112,7 @@ fn a_server_that_has_ended_is_not_counted_though_responses_are_still_to_come() {
 }
 
 #[test]
-fn a_publisher_that_has_ended_is_not_counted_though_more_of_it_is_to_come() {
+fn ended_publisher_with_backlog_is_not_counted() {
     with_both_ends(|here, there| {
         let (publisher, subscription) = connect(here, there, "/t", Qos::keep_all());
         let last = fill(|number| publisher.publish(&pattern(number, 50_000)));

@@ -450,7 +450,7 @@ fn unrequested_responses_of_a_hostile_server_reach_no_client() {
 }
 
 #[test]
-fn a_reader_that_gives_no_credit_back_does_not_make_the_daemon_keep_ended_writers() {
+fn reader_without_credit_does_not_keep_ended_writers() {
     let host = host();
     let _daemon = host.daemon();
     let here = session(&host, "here", true);

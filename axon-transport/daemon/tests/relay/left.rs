@@ -89,7 +89,7 @@ fn undelivered_samples_of_an_ended_process_are_counted_by_topic() {
 }
 
 #[test]
-fn samples_that_are_lost_before_the_first_and_after_the_last_are_counted_by_topic() {
+fn samples_lost_at_the_start_and_the_end_are_counted_by_topic() {
     let host = host();
     let _daemon = host.daemon();
     let listener = session(&host, "listener", true);

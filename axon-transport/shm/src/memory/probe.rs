@@ -53,7 +53,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn memory_that_may_not_be_read_is_out_of_reach_and_other_memory_is_not() {
+    fn unreadable_memory_is_found_and_other_memory_is_readable() {
         let probe = probe().unwrap();
         assert!(out_of_reach(&probe).is_none());
         let path = format!("/proc/self/fd/{}", std::os::fd::AsRawFd::as_raw_fd(&probe));

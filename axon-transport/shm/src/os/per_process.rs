@@ -116,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn all_threads_of_a_process_find_the_same_and_a_fork_its_own_though_the_parents_is_locked() {
+    fn singleton_is_shared_by_threads_and_made_anew_after_a_fork() {
         let barrier = Barrier::new(4);
         let found: Vec<_> = thread::scope(|scope| {
             let find = || {

@@ -129,7 +129,7 @@ mod tests {
     }
 
     #[test]
-    fn a_reader_that_was_told_of_the_end_asks_anew_and_twice_for_each_segment() {
+    fn reader_requests_each_segment_twice_after_the_end_of_the_writer() {
         let mut awaited = AwaitedSegment::default();
         assert_eq!(waits(&mut awaited, 1, 5, false), [Wait::Ask; 6]);
         awaited.end();

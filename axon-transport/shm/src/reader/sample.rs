@@ -133,7 +133,8 @@ impl Sample {
         count
     }
 
-    /// Fills `out` with its first bytes. Returns false, with nothing written, in a forked child. For this project's crates.
+    /// Fills `out` with its first bytes. Returns false, with nothing written, in a forked child. For this project's
+    /// crates.
     ///
     /// # Panics
     /// `out` is longer than the sample.

@@ -124,7 +124,7 @@ fn history_for_late_readers_is_bounded_by_bytes() {
 }
 
 #[test]
-fn history_for_late_readers_is_kept_though_a_reader_lacks_the_memory_that_it_moves_to() {
+fn keep_all_history_survives_a_move_that_one_reader_cannot_map() {
     let (a, b) = (silent_session(), session());
     let writer = writer(&a, keep_all_for_later(), 64 << 20);
     let (mut reader, from) = attach_untold(&writer, &a, &b, keep_last(1));
@@ -223,14 +223,14 @@ fn ring_stays_in_its_segment(offered: Qos, wanted: Qos) {
 }
 
 #[test]
-fn a_ring_does_not_move_to_where_a_reader_that_has_taken_all_cannot_follow() {
+fn ring_stays_while_a_reader_that_has_taken_all_cannot_map_the_new_segment() {
     ring_stays_in_its_segment(keep_last(1), keep_last(10_000));
     let latched = |depth| keep_last(depth).with_durability(Durability::TransientLocal);
     ring_stays_in_its_segment(latched(1), latched(10_000));
 }
 
 #[test]
-fn history_within_the_depth_is_kept_though_a_reader_lacks_the_memory_that_it_moves_to() {
+fn history_within_the_depth_survives_a_move_that_one_reader_cannot_map() {
     let (a, b) = (silent_session(), session());
     let latched = keep_last(6000).with_durability(Durability::TransientLocal);
     let writer = writer(&a, latched, 64 << 20);
@@ -246,7 +246,7 @@ fn history_within_the_depth_is_kept_though_a_reader_lacks_the_memory_that_it_mov
 }
 
 #[test]
-fn a_reader_that_lacks_the_descriptors_sleeps_although_its_depth_is_exceeded() {
+fn reader_without_the_descriptors_sleeps_after_its_depth_is_exceeded() {
     let (a, b) = (silent_session(), session());
     let writer = writer(&a, keep_last(1), 64 << 20);
     let (slow, _) = attach_untold(&writer, &a, &b, keep_last(10_000));
@@ -446,7 +446,7 @@ fn memory_of_ended_publishers_is_reused() {
 }
 
 #[test]
-fn thousands_of_publishers_that_end_one_after_the_other_are_not_looked_at_each_time() {
+fn ended_publishers_are_not_checked_again_at_each_end() {
     const MANY: usize = 3000;
     let (a, b) = (session(), session());
     let from = peer(&b, &a);

@@ -169,7 +169,7 @@ fn memory_of_a_publisher_that_is_gone_is_let_go_of() {
 }
 
 #[test]
-fn memory_of_a_publisher_without_subscribers_here_is_let_go_of_though_others_read_us() {
+fn memory_of_an_unread_publisher_is_unmapped_while_own_samples_are_read() {
     let (here, there) = contexts();
     let (ours, theirs) = (publisher(&here, keep_last(1)), publisher(&there, keep_last(1)));
     // The other way round.

@@ -1,4 +1,4 @@
-//! Reads `[[limit]]`.
+//! Parses `[[limit]]`.
 
 use std::{collections::BTreeSet, num::NonZeroU32, ops::Range, sync::Arc};
 
@@ -11,13 +11,13 @@ use crate::access::{
     party::PartyPattern,
 };
 
-/// The lowest rate, and the highest, a second.
+/// The lowest and the highest rate, per second.
 const RATES: (f64, f64) = (0.01, 1e6);
-/// The lowest number of bytes a second, and the highest.
+/// The lowest and the highest number of bytes per second.
 const BYTES: (f64, f64) = (1.0, 1e12);
-/// Patterns of all limits: a route is compared with each of them.
+/// Maximum number of patterns in all limits. A route is compared with each of them.
 const MOST_LIMITED: usize = 1024;
-/// The lowest egress, in bytes a second.
+/// The lowest egress limit, in bytes per second.
 const LEAST_EGRESS: f64 = 1e4;
 /// Units of `bytes`, in bytes.
 const UNITS: [(&str, f64); 10] = [
@@ -32,14 +32,14 @@ const UNITS: [(&str, f64); 10] = [
     ("Mbit/s", 125e3),
     ("Gbit/s", 125e6),
 ];
-/// The burst of a limit that says none: samples of a topic that keeps to the rate do not come exactly in time.
+/// The default burst of a limit. Samples of a topic that keeps to the rate do not arrive at exact times.
 const TWO: NonZeroU32 = NonZeroU32::MIN.saturating_add(1);
 const NO_USER: &str = "names of hosts: samples within a host have no limits";
 
-/// Bytes a second, such as `4 MB/s`.
+/// Parses bytes per second, such as `4 MB/s`.
 ///
 /// # Errors
-/// What would be some.
+/// The accepted values.
 pub(crate) fn bytes_a_second(text: &str) -> Result<f64, &'static str> {
     const ACCEPTED: &str = "a number and B/s, kB/s, MB/s, GB/s, KiB/s, MiB/s, GiB/s, kbit/s, Mbit/s or Gbit/s, from \
                             1 B/s to 1000 GB/s";
@@ -53,10 +53,10 @@ pub(crate) fn bytes_a_second(text: &str) -> Result<f64, &'static str> {
     (BYTES.0..=BYTES.1).contains(&bytes).then_some(bytes).ok_or(ACCEPTED)
 }
 
-/// A rate, as a number or integer of TOML.
+/// Parses a rate, as TOML writes a number or an integer.
 ///
 /// # Errors
-/// What would be one.
+/// The accepted values.
 pub(crate) fn rate(text: &str) -> Result<f64, &'static str> {
     let rate = text.replace('_', "").parse().ok();
     let rate = rate.filter(|rate| (RATES.0..=RATES.1).contains(rate));
@@ -65,15 +65,15 @@ pub(crate) fn rate(text: &str) -> Result<f64, &'static str> {
 
 /// The longest name of an interface, in bytes (IFNAMSIZ without its NUL).
 const LONGEST_NAME: usize = 15;
-/// Interfaces that an entry names at most.
+/// Maximum number of interfaces that an entry names.
 const MOST_INTERFACES: usize = 64;
 
-/// All `[[limit]]` of a file.
+/// All `[[limit]]` entries of a file.
 #[derive(Default)]
 pub(super) struct Entries {
-    /// Those of peers.
+    /// The limits of peers.
     pub(super) peers: Vec<LimitRule>,
-    /// Those of interfaces.
+    /// The limits of interfaces.
     pub(super) interfaces: Vec<InterfaceLimit>,
 }
 
@@ -83,13 +83,13 @@ impl Entries {
     }
 }
 
-/// One of them.
+/// One `[[limit]]` entry.
 enum LimitEntry {
     Peer(LimitRule),
     Interface(InterfaceLimit),
 }
 
-/// The parts of an entry.
+/// The values of an entry by key.
 #[derive(Default)]
 struct Parts {
     peers: Vec<PartyPattern>,
@@ -191,7 +191,7 @@ impl RuleFileReader<'_> {
                 }
                 ("egress", DeValue::String(text)) => {
                     let bytes = bytes_a_second(text);
-                    // Below that a handshake that follows would not come through.
+                    // Below this rate, a handshake that follows would not complete.
                     let bytes = bytes.and_then(|bytes| match bytes >= LEAST_EGRESS {
                         true => Ok(bytes),
                         false => Err("10 kB/s at least"),
@@ -232,8 +232,10 @@ impl RuleFileReader<'_> {
         self.whole(parts, line).map_err(|what| self.wrong(span, what))
     }
 
+    /// Builds an entry from its values.
+    ///
     /// # Errors
-    /// What is missing, or does not go together.
+    /// A value is missing, or values exclude each other.
     fn whole(&self, parts: Parts, line: u32) -> Result<LimitEntry, &'static str> {
         let Parts { peers, interfaces, mut uses, rate, bytes, burst, over, together, egress } =
             parts;
@@ -270,7 +272,7 @@ impl RuleFileReader<'_> {
                 "[[limit]] of call: write over = \"hold\", since no request is dropped, and no topic",
             );
         }
-        // Without topics it is about all that the peer sends, and all that it gets.
+        // Without topics, the limit applies to all samples that the peer sends and receives.
         let is_of_peer = uses.is_empty();
         if is_of_peer {
             let all = TopicPattern::new("**").map_err(|_| "** is a pattern")?;
@@ -290,10 +292,10 @@ impl RuleFileReader<'_> {
     }
 }
 
-/// The name of an interface, or a pattern of names.
+/// Returns `text` if it is the name of an interface, or a pattern of names.
 ///
 /// # Errors
-/// What would be one.
+/// The accepted values.
 fn interface(text: &str) -> Result<String, &'static str> {
     let is_name = |c: char| c.is_ascii_graphic() && c != '/';
     let fits = (1..=LONGEST_NAME).contains(&text.len()) && text.chars().all(is_name);

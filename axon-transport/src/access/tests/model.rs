@@ -1,4 +1,4 @@
-//! Decisions beside a definition of them that tries each rule.
+//! Compares decisions with a reference model that tries each rule.
 
 use proptest::prelude::*;
 
@@ -10,7 +10,7 @@ struct ModelRule {
     denies: bool,
     peer: &'static str,
     key: &'static str,
-    /// A pattern; `true` of parameters and lifecycle.
+    /// A pattern, or `true` for parameters and lifecycle.
     name: &'static str,
 }
 
@@ -66,7 +66,7 @@ impl ModelRule {
         }
     }
 
-    /// Whether a name is of one of these parts, of something that the pattern fits.
+    /// Returns whether a name is one of `parts` below a name that the pattern fits.
     fn fits_part(&self, name: &str, parts: &[&str]) -> bool {
         let base = |part: &&str| name.strip_suffix(*part)?.strip_suffix('/');
         parts.iter().filter_map(base).any(|base| self.fits(base))
@@ -94,8 +94,9 @@ impl ModelRule {
     }
 }
 
-/// Whether a party may do something, and the line that says so: a `[[deny]]`; else an `[[allow]]`; else nothing for a
-/// party that an `[[allow]]` names, or by default; else all but what a `[[deny]]` hides.
+/// Returns whether a party may do something, and the line that decides. A `[[deny]]` decides first, then an
+/// `[[allow]]`. Otherwise, a party that an `[[allow]]` names may do nothing, and neither may others if the default is
+/// to deny. All others may do everything that no `[[deny]]` hides.
 fn decision(
     rules: &[ModelRule],
     deny: bool,
@@ -103,7 +104,7 @@ fn decision(
     verb: Verb,
     name: &str,
 ) -> (bool, Option<u32>) {
-    // The default has the first line, and each rule three.
+    // The default takes the first line, and each rule takes three lines.
     let named = (1..).zip(rules).filter(|(_, rule)| rule.names(party));
     let named: Vec<_> = named.map(|(number, rule)| (3 * number + 1, rule)).collect();
     let line = |denies, verb| {

@@ -14,7 +14,7 @@ use proptest::prelude::*;
 use super::*;
 
 mod builder;
-mod place;
+mod daemon_location;
 mod refused;
 
 /// A file system in memory, so that any bytes may name files in it.

@@ -375,7 +375,7 @@ fn rules_that_cannot_be_used_are_refused_with_their_place() {
 }
 
 #[test]
-fn the_rules_of_the_host_count_where_the_settings_name_none_and_never_count_as_none() {
+fn rules_of_the_host_apply_without_a_setting_and_fail_closed() {
     const RULES: &str = "[[allow]]\npeer = \"*\"\npublish = \"/x\"";
     let of_host = Path::new("/etc/axon/access.toml");
     let load = |env: &[(&str, &str)], mode, text: &str| {

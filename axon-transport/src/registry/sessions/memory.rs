@@ -206,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn a_segment_that_was_asked_for_again_is_known_as_such_when_it_is_given_up() {
+    fn given_up_segment_reports_a_repeated_request() {
         let mut held = HeldMemory::default();
         assert!(!held.miss(&OTHER, 1));
         held.introduce(OTHER, pair(1));

@@ -171,7 +171,7 @@ fn with_earlier_grants(sessions: &[u8]) -> Registry<&'static str> {
 }
 
 #[test]
-fn a_reader_is_handed_the_ring_of_a_publisher_whose_process_was_killed_before_it_came() {
+fn reader_receives_the_ring_of_a_publisher_that_was_killed_before() {
     let segments = vec![Segment { number: 1, publisher: None }];
     let expected = Granted { segments, ..grant(unmet(0).reader, unmet(0).writer) };
     let descriptors = vec!["segment", "doorbell", "pidfd", "heap"];
@@ -207,7 +207,7 @@ fn a_publisher_that_ended_itself_has_reported_its_readers_losses() {
 }
 
 #[test]
-fn a_grant_that_a_session_did_not_take_in_time_comes_though_the_publisher_is_killed() {
+fn late_grant_arrives_although_the_publisher_was_killed() {
     let mut registry = registry(&[WRITER, READER]);
     announce(&mut registry);
     let Unmet { reader, writer, .. } = unmet(0);
@@ -230,7 +230,7 @@ fn a_grant_that_a_session_did_not_take_in_time_comes_though_the_publisher_is_kil
 }
 
 #[test]
-fn the_oldest_of_the_rings_that_wait_for_their_readers_is_given_up_beyond_the_bound() {
+fn oldest_waiting_ring_is_given_up_beyond_the_bound() {
     let mut registry = registry(&[WRITER]);
     let reader = unmet(0).reader;
     let writers: Vec<Gid> = (0..=MAX_LEFT as u32).map(|n| Gid::new(id(WRITER), 1 + n)).collect();
@@ -249,7 +249,7 @@ fn the_oldest_of_the_rings_that_wait_for_their_readers_is_given_up_beyond_the_bo
 }
 
 #[test]
-fn memory_is_handed_to_no_tool_and_no_other_user_that_claims_the_id_of_a_reader() {
+fn memory_is_handed_to_the_session_of_the_reader_alone() {
     type Claims = fn(&mut Registry<&'static str>);
     let tool: Claims = |registry| {
         let role = SessionRole::Tool;
@@ -333,7 +333,7 @@ fn grants_of_a_process_that_repeats_many_displace_no_grant_of_another_one() {
 }
 
 #[test]
-fn reader_that_is_stopped_hears_of_a_pair_though_another_process_told_it_of_very_many() {
+fn stopped_reader_receives_its_grant_despite_a_flood_from_another_process() {
     let mut registry = registry(&[WRITER, OTHER, READER]);
     let of = |number| Unmet { writer: Gid::new(id(OTHER), number), ..unmet(1) };
     others_say(&mut registry, 2000, |number| SessionMessage::Unmet(of(number)));
@@ -359,7 +359,7 @@ fn hang_up(registry: &mut Registry<&'static str>, session: u8) {
 }
 
 #[test]
-fn ring_of_a_session_that_hung_up_is_handed_over_once_its_process_has_ended() {
+fn ring_of_a_disconnected_session_is_handed_over_after_its_process_ended() {
     for comes_before in [false, true] {
         let mut registry = with_earlier_grants(&[WRITER]);
         if comes_before {

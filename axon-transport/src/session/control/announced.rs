@@ -1,29 +1,29 @@
-//! What one connection's daemon and session have told each other.
+//! The pairs and segments that the daemon and the session announced to each other over one connection.
 
 use std::collections::{BTreeSet, HashSet};
 
 use crate::{ids::Gid, wire::session::Pair};
 
-/// The pairs that the daemon of this connection has told of. What it never told of stands by the word of an earlier
-/// one, and this one may know nothing of it yet: a stopped process has not come back.
+/// The pairs that the daemon of this connection announced. All other pairs were announced by an earlier daemon. This
+/// daemon may not know them yet, because a stopped process has not reconnected.
 #[derive(Debug, Default)]
 pub(super) struct AnnouncedPairs {
     told: HashSet<Pair>,
-    /// Those that it repeated since it began to tell everything anew.
+    /// The pairs that the daemon repeated since it began to announce everything again.
     repeated: Option<HashSet<Pair>>,
-    /// Whether it has told everything already.
+    /// True once the daemon has begun to announce everything.
     whole: bool,
 }
 
 impl AnnouncedPairs {
-    /// The daemon begins to tell everything. One that tells everything to a session it knew repeats every pair that
-    /// it told it of. A new daemon learns of the pairs from their two sides, one by one.
+    /// Begins a full announcement by the daemon. A daemon that announces everything to a session that it knew repeats
+    /// each pair that it announced. A new daemon learns the pairs from their two ends, one by one.
     pub(super) fn begin_whole(&mut self) {
         self.repeated = self.whole.then(HashSet::new);
         self.whole = true;
     }
 
-    /// The daemon says that a pair stands, or is to.
+    /// Records that the daemon announced a pair that exists or is to be created.
     pub(super) fn tell(&mut self, pair: Pair) {
         self.told.insert(pair);
         if let Some(repeated) = &mut self.repeated {
@@ -31,17 +31,18 @@ impl AnnouncedPairs {
         }
     }
 
-    /// The daemon says that a pair is over.
+    /// Records that the daemon ended a pair.
     pub(super) fn remove(&mut self, pair: &Pair) {
         self.told.remove(pair);
     }
 
-    /// Endpoints ended.
+    /// Removes the pairs of endpoints that ended.
     pub(super) fn remove_endpoints(&mut self, gids: &HashSet<Gid>) {
         self.told.retain(|pair| !gids.contains(&pair.reader) && !gids.contains(&pair.writer));
     }
 
-    /// The daemon has told everything. If it did so before, returns the pairs that it did not repeat: they are over.
+    /// Ends a full announcement. If it was not the first one, returns the pairs that the daemon did not repeat, which
+    /// have ended.
     pub(super) fn end_whole(&mut self) -> Option<HashSet<Pair>> {
         let repeated = self.repeated.take()?;
         let mut over = std::mem::replace(&mut self.told, repeated);
@@ -50,8 +51,8 @@ impl AnnouncedPairs {
     }
 }
 
-/// The segments of the session's memory that this connection's daemon was told of, and those that it could not be told
-/// of, for want of descriptors. None is both.
+/// The segments of the session's memory that were announced to this connection's daemon, and those that could not be
+/// announced for lack of descriptors. No segment is in both sets.
 #[derive(Debug, Default)]
 pub(super) struct AnnouncedSegments {
     told: BTreeSet<u32>,
@@ -63,23 +64,23 @@ impl AnnouncedSegments {
         self.told.contains(&number)
     }
 
-    /// Whether there are none that the daemon could not be told of.
+    /// Returns whether no segment's announcement failed.
     pub(super) fn are_complete(&self) -> bool {
         self.untold.is_empty()
     }
 
-    /// Those that the daemon could not be told of.
+    /// Returns the segments that could not be announced.
     pub(super) fn untold(&self) -> Vec<u32> {
         self.untold.iter().copied().collect()
     }
 
-    /// The daemon is told of one.
+    /// Records that a segment is announced to the daemon.
     pub(super) fn tell(&mut self, number: u32) {
         self.untold.remove(&number);
         self.told.insert(number);
     }
 
-    /// The daemon cannot be told of one. Returns whether that is new.
+    /// Records that a segment cannot be announced to the daemon. Returns whether that is new.
     pub(super) fn fail(&mut self, number: u32) -> bool {
         self.untold.insert(number)
     }

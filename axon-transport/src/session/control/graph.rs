@@ -26,7 +26,7 @@ pub(super) struct GraphFollower {
     arrivals: PendingEndpoints,
     /// The endpoints of the graph by topic. While a full graph is incomplete, this map is about that graph.
     topics: HashMap<String, BTreeSet<Gid>>,
-    /// Whether the graph changed since it was last reported.
+    /// True if the graph changed since it was last reported.
     changed: bool,
 }
 
@@ -42,12 +42,12 @@ impl GraphFollower {
         }
     }
 
-    /// Forgets an incomplete graph of the daemon before.
+    /// Forgets an incomplete graph of the previous daemon.
     pub(super) fn handle_connected(&mut self) {
         self.building = None;
     }
 
-    /// Begins a full graph, which replaces the one that is shown once it is complete.
+    /// Begins a full graph, which replaces the shown one when it is complete.
     pub(super) fn begin_whole(&mut self) {
         self.building = Some(GraphView::default());
         self.topics.clear();
@@ -65,8 +65,8 @@ impl GraphFollower {
         removed.iter().for_each(|gid| self.disappear(gid));
     }
 
-    /// Adds endpoints, or what changed of them. They appear once their pairs with endpoints of this session are
-    /// attached.
+    /// Adds endpoints, or changes of endpoints. They appear once their pairs with endpoints of this session
+    /// are attached.
     pub(super) fn add(&mut self, added: impl IntoIterator<Item = GraphEntry>) {
         added.into_iter().for_each(|entry| self.appear(entry));
     }
@@ -101,19 +101,19 @@ impl GraphFollower {
         }
     }
 
-    /// Shows the endpoints that waited for pairs with this endpoint of the session alone, since it ended.
+    /// Shows the endpoints that waited only for pairs with this endpoint of the session, because it ended.
     pub(super) fn handle_own_gone(&mut self, gid: &Gid) {
         for entry in self.arrivals.own_gone(gid) {
             self.show(entry);
         }
     }
 
-    /// Returns when the next endpoint has waited for its pairs for long enough.
+    /// Returns the time at which the next endpoint has waited long enough for its pairs.
     pub(super) fn poll_timeout(&self) -> Option<Instant> {
         self.arrivals.due()
     }
 
-    /// Shows the endpoints that have waited for long enough, and reports the graph if it changed.
+    /// Shows the endpoints that have waited long enough, and reports the graph if it changed.
     pub(super) fn report_changes(&mut self) {
         for entry in self.arrivals.overdue(Instant::now()) {
             self.show(entry);
@@ -128,7 +128,7 @@ impl GraphFollower {
         let own = endpoint.gid.0[..12] == self.shared.core.id.0[..12];
         if own {
             let state = self.shared.state();
-            // It may have ended since it was announced: the daemon will say so.
+            // The endpoint may have ended since it was announced: the daemon will report that.
             if state.graph.tombstones.contains(&endpoint.gid)
                 || state.endpoints.leaving.contains_key(&endpoint.gid)
                 || state.graph.refused.contains_key(&endpoint.gid)
@@ -168,7 +168,7 @@ impl GraphFollower {
         self.view(|view| drop(view.endpoints.insert(entry.endpoint.gid, entry)));
     }
 
-    /// Changes the view that is being built, or else the one that is shown.
+    /// Changes the view that is being built, otherwise the one that is shown.
     fn view(&mut self, change: impl FnOnce(&mut GraphView)) {
         match &mut self.building {
             Some(view) => change(view),
@@ -176,7 +176,7 @@ impl GraphFollower {
         }
     }
 
-    /// The pairs that an endpoint makes with the session's own and that do not stand yet.
+    /// Returns the pairs of an endpoint with the session's own endpoints that are not attached yet.
     fn missing(&self, other: &Endpoint) -> BTreeSet<Pair> {
         let state = self.shared.state();
         let mut missing = BTreeSet::new();
@@ -197,11 +197,13 @@ impl GraphFollower {
         missing
     }
 
-    /// Reports to the session's endpoints that one does not go with them, and, if it is of this
-    /// session, to it that others do not. The endpoint that comes second finds the first.
+    /// Reports an endpoint to the session's endpoints that are incompatible with it. If it is an endpoint
+    /// of this session, also reports incompatible endpoints to it. The endpoint that comes second finds the
+    /// first.
     fn relate(&self, endpoint: &Endpoint) {
         let here = self.own(&endpoint.topic);
-        // One of its own may have ended since it was announced, and others begun that never met it.
+        // An own endpoint may have ended since it was announced. Own endpoints that began later never met
+        // it.
         let is_own = |gid: &Gid| gid.0[..12] == self.shared.core.id.0[..12];
         let ended = |gid: &Gid| is_own(gid) && here.iter().all(|own| own.endpoint().gid != *gid);
         if ended(&endpoint.gid) {
@@ -215,7 +217,7 @@ impl GraphFollower {
         };
         let shown = self.shared.state().graph.view.clone();
         let shown = self.building.as_ref().unwrap_or(&shown);
-        // The session's own that nobody was told of yet are met when they are told.
+        // Own endpoints that are not announced yet are compared when they are announced.
         let others = self.topics.get(&endpoint.topic).into_iter().flatten();
         let others = others.filter_map(|gid| shown.endpoints.get(gid));
         for other in others.chain(self.arrivals.entries()) {
@@ -236,7 +238,7 @@ impl GraphFollower {
         }
     }
 
-    /// The session's publishers and subscriptions of a topic.
+    /// Returns the session's publishers and subscriptions of a topic.
     fn own(&self, topic: &str) -> Vec<EventSource> {
         let state = self.shared.state();
         let mut own = Vec::new();

@@ -17,18 +17,18 @@ use crate::{
     wire::session::SessionMessage,
 };
 
-/// Brings the sessions of one process together.
+/// A registry that connects the sessions of one process.
 #[derive(Debug, Default)]
 pub(crate) struct LocalRegistry(Mutex<LocalRegistryState>);
 
 #[derive(Debug, Default)]
 struct LocalRegistryState {
     registry: Registry<Arc<PassedFd>>,
-    /// What wakes the control thread of each session.
+    /// The waker of each session's control thread.
     wakers: HashMap<SessionId, Arc<ControlWaker>>,
 }
 
-/// A session's end of it.
+/// A session's connection to the registry.
 #[derive(Debug)]
 pub(in crate::session) struct InProcessDaemon {
     id: SessionId,
@@ -36,14 +36,15 @@ pub(in crate::session) struct InProcessDaemon {
 }
 
 impl LocalRegistry {
-    /// What the world outside has: endpoints of `daemon` that are new, and those that are gone.
+    /// Updates the endpoints outside the process: adds new endpoints of `daemon`, and removes those that
+    /// ended.
     pub(crate) fn outside(&self, daemon: DaemonId, added: Vec<Endpoint>, removed: Vec<Gid>) {
         let mut inside = self.lock();
         inside.registry.remote_graph(daemon, false, added, removed);
         inside.settle(None);
     }
 
-    /// There is no world outside any more, as far as `daemon` spoke for it.
+    /// Removes the endpoints outside the process that `daemon` reported.
     pub(crate) fn outside_gone(&self, daemon: &DaemonId) {
         let mut inside = self.lock();
         inside.registry.remote_gone(daemon);
@@ -56,7 +57,7 @@ impl LocalRegistry {
 }
 
 impl LocalRegistryState {
-    /// Wakes the sessions that have something to hear, but the one that is about to listen.
+    /// Wakes the sessions that have messages, except the one that is about to receive.
     fn settle(&mut self, listening: Option<&SessionId>) {
         self.registry.flush();
         self.registry.answer_fences();
@@ -71,7 +72,7 @@ impl LocalRegistryState {
 }
 
 impl InProcessDaemon {
-    /// A registry of its own, where nobody else is and nothing is handed to anybody.
+    /// Creates a registry for this session alone. It passes no descriptors.
     pub(in crate::session) fn alone(session: &SessionCore) -> Self {
         Self::enter(Arc::default(), session, None)
     }
@@ -94,13 +95,13 @@ impl InProcessDaemon {
         let (id, role, name) = (session.id, session.options.role, session.options.name.clone());
         let mut inside = local_registry.lock();
         inside.wakers.insert(id, session.waker.clone());
-        // There are at most two, which is never too many.
+        // A registry has at most two sessions, which is never too many.
         let _ = inside.registry.handle_connect(id, role, name, std::process::id(), handed, None);
         drop(inside);
         Self { id, local_registry }
     }
 
-    /// What a daemon would answer to nothing, or to a message.
+    /// Passes a message, if any, to the registry, and returns the messages for this session.
     pub(in crate::session) fn exchange(
         &mut self,
         message: Option<(SessionMessage, Vec<PassedFd>)>,
@@ -129,7 +130,7 @@ impl InProcessDaemon {
                 }
             }
         }
-        // By now it was sent what others wait for it to be sent.
+        // Fences of other sessions may wait for the messages that this session has now received.
         inside.settle(None);
         answers
     }

@@ -26,7 +26,7 @@ impl ControlThread {
             state.forget_refusals();
             let gids = state.endpoints.gids();
             let mut outgoing: Vec<_> = gids.into_iter().map(Outgoing::Announce).collect();
-            // Behind the announcements, and the memory that they name.
+            // Grants follow the announcements and the memory that they name.
             let untaken_grants = state
                 .endpoints
                 .publishers
@@ -35,7 +35,7 @@ impl ControlThread {
             outgoing.extend(
                 untaken_grants.map(|granted| Outgoing::message(SessionMessage::Grant(granted))),
             );
-            // Before their ends.
+            // The reports precede the ends of the publishers.
             let unmet =
                 state.unmet.iter().map(|unmet| Outgoing::message(SessionMessage::Unmet(unmet)));
             outgoing.extend(unmet);
@@ -68,7 +68,7 @@ impl ControlThread {
         }
     }
 
-    /// Whether there is a daemon, or may be one.
+    /// Returns whether the session has a daemon or searches for one.
     pub(super) fn is_served(&self) -> bool {
         matches!(self.link, DaemonConnection::Socket(_) | DaemonConnection::Reconnecting(_))
     }

@@ -1,4 +1,4 @@
-//! What became of the pairs of the session's endpoints: counted, and reported as events.
+//! Counts the pairs of the session's endpoints, and reports changes as events.
 
 use std::{collections::BTreeMap, sync::Arc};
 
@@ -14,7 +14,7 @@ use crate::{
     wire::session::Pair,
 };
 
-/// The endpoints of the session whose pairs changed and were not counted since. Where many pairs of an endpoint
+/// The endpoints of the session whose pairs changed since the last count. If many pairs of an endpoint
 /// change at once, they are counted once.
 pub(super) struct ChangedMatches {
     shared: Arc<SessionShared>,
@@ -38,7 +38,7 @@ impl ChangedMatches {
         self.readers.insert(subscription.endpoint.gid, subscription.clone());
     }
 
-    /// Counts the pairs of the recorded endpoints, and reports what changed.
+    /// Counts the pairs of the recorded endpoints, and reports the changes.
     pub(super) fn report(&mut self, graph: &mut GraphFollower, timed: &mut TimedEndpoints) {
         let writers = std::mem::take(&mut self.writers).into_values().map(EventSource::Publisher);
         let readers = std::mem::take(&mut self.readers).into_values();
@@ -47,7 +47,7 @@ impl ChangedMatches {
         }
     }
 
-    /// Reports what other threads of the session changed.
+    /// Reports the changes that other threads of the session made.
     pub(super) fn report_others(&self, graph: &mut GraphFollower, timed: &mut TimedEndpoints) {
         let (rematched, graph_changed) = {
             let mut state = self.shared.state();

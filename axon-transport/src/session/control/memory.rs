@@ -23,12 +23,12 @@ pub(super) struct AnnouncedMemory {
     announced: AnnouncedSegments,
     /// Publishers without prepared memory for their next large sample.
     low: BTreeSet<Gid>,
-    /// When to check the memory of large samples; `None` if there is none.
+    /// The time of the next check of the memory of large samples. `None` if there is none.
     check: Option<Instant>,
 }
 
 impl AnnouncedMemory {
-    /// Creates the memory of a session that announced none of it.
+    /// Creates the memory of a session that has announced no segments.
     pub(super) fn new(shared: Arc<SessionShared>) -> Self {
         Self { shared, announced: AnnouncedSegments::default(), low: BTreeSet::new(), check: None }
     }
@@ -47,7 +47,7 @@ impl AnnouncedMemory {
         self.announced.are_complete()
     }
 
-    /// Takes what changed in the session's memory, and which memory of other sessions its readers lack.
+    /// Announces changes of the session's memory, and requests segments of other sessions that readers lack.
     pub(super) fn announce(&mut self, outbox: &mut Outbox, peers: &Peers) {
         for number in self.announced.untold() {
             self.handle_change(SegmentChange::Opened(number), outbox, peers);
@@ -68,7 +68,7 @@ impl AnnouncedMemory {
                     let opened = SegmentOpened { session, segment: info.into() };
                     outbox.push_back((SessionMessage::Segment(opened), vec![descriptor.into()]));
                 }
-                // It is gone again.
+                // The segment is already closed.
                 Ok(None) => self.announced.remove(number),
                 Err(error) => {
                     if self.announced.fail(number) {
@@ -101,14 +101,14 @@ impl AnnouncedMemory {
         for gid in std::mem::take(&mut self.low) {
             let publisher = self.shared.state().endpoints.publishers.get(&gid).cloned();
             if let Some(publisher) = publisher {
-                // What is still missing is found by the publisher's next publish.
+                // The publisher's next publish detects memory that is still missing.
                 publisher.rings.prepare();
                 self.check_later();
             }
         }
     }
 
-    /// Has the memory checked later, since some of it may have to be freed.
+    /// Schedules a check of the memory, because some of it may have to be freed.
     pub(super) fn check_later(&mut self) {
         self.check.get_or_insert_with(|| Instant::now() + CHECK_INTERVAL);
     }
@@ -118,8 +118,8 @@ impl AnnouncedMemory {
         self.check
     }
 
-    /// Frees idle memory of large samples and memory of ended publishers, if the time for it has come. Only while
-    /// the session is linked: freed memory may have to be opened anew, and only a daemon can announce it to readers.
+    /// Frees idle memory of large samples and memory of ended publishers, if the check is due. The session must be
+    /// linked: freed memory may have to be opened again, and only a daemon can announce it to readers.
     pub(super) fn handle_timeout(&mut self) {
         let now = Instant::now();
         if self.check.is_none_or(|due| now < due) {

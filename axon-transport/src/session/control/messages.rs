@@ -42,7 +42,7 @@ impl ControlThread {
             }
             SessionMessage::Status(part) => self.status(&part),
             SessionMessage::Refused(SessionRefused { endpoint, text: reason, .. }) => {
-                // The process that is relayed logs it itself.
+                // The relayed process itself logs the refusal.
                 if !self.shared.core.options.keeps_refusals {
                     tracing::error!(reason, "the daemon refuses something of the session");
                 }
@@ -51,7 +51,7 @@ impl ControlThread {
                     None => self.shared.keep_refusal(reason),
                 }
             }
-            // What a daemon never says is not worth more than not being heard.
+            // A daemon never sends the other messages. They are ignored.
             _ => {}
         }
     }
@@ -79,7 +79,7 @@ impl ControlThread {
             let told = unrepeated.is_some();
             if let Some(unrepeated) = unrepeated {
                 self.drop_pairs(&unrepeated);
-                // An answer may have been among what was too much for this session.
+                // The session may have missed an answer while it was too slow.
                 self.shared.core.memory.begins_anew();
             }
             self.drop_unread(told);
@@ -89,17 +89,17 @@ impl ControlThread {
 
     fn status(&self, part: &StatusPart) {
         if self.shared.core.link.add_status(part) {
-            // Those who wait for the whole.
+            // Wakes the threads that wait for the whole status.
             self.shared.notify(None);
         }
     }
 
-    /// Endpoints ended, perhaps while there was no daemon to say who was attached to them.
+    /// Removes endpoints that ended, perhaps while no daemon could report their attached endpoints.
     fn endpoints_over(&mut self, gids: &[Gid]) {
         if gids.is_empty() {
             return;
         }
-        // Thousands may end at a time, and be attached to one each.
+        // Thousands of endpoints may end at a time, each attached to one other.
         let gids: HashSet<Gid> = gids.iter().copied().collect();
         self.pairs.remove_endpoints(&gids);
         let (publishers, subscriptions) = self.shared.state().endpoints.all();
@@ -132,7 +132,7 @@ impl ControlThread {
         }
     }
 
-    /// A writer has ended, or has not after all, and more comes of it.
+    /// Records that a writer has ended while samples of it still arrive, or that it has not ended after all.
     fn leave(&mut self, WriterLeaving { gid, leaving }: WriterLeaving) {
         let (_, subscriptions) = self.shared.state().endpoints.all();
         for subscription in subscriptions {
@@ -142,7 +142,7 @@ impl ControlThread {
         }
     }
 
-    /// A publisher ended before this session was told what it granted to one of its readers.
+    /// Counts samples of a publisher that ended before this session received its grant to one of its readers.
     fn unmet(&self, Unmet { reader, writer, samples }: Unmet) {
         let subscription = self.shared.state().endpoints.subscriptions.get(&reader).cloned();
         let Some(subscription) = subscription else { return };
@@ -153,33 +153,33 @@ impl ControlThread {
                 topic, %writer, samples,
                 "samples are lost: their publisher ended before this process was told of it"
             );
-            // Those who wait for losses.
+            // Wakes the threads that wait for losses.
             self.shared.core.segment.notify();
         }
     }
 
-    /// A relay of a publisher here gave samples up.
+    /// Records the samples that a relay of a publisher of this session gave up.
     fn give_up(&self, RelayGivenUp { reader, writer, samples }: RelayGivenUp) {
         let publisher = self.shared.state().endpoints.publishers.get(&writer).cloned();
         if let Some(publisher) = publisher {
             publisher.rings.give_up(reader, samples);
-            // Those who wait for acknowledgements.
+            // Wakes the threads that wait for acknowledgements.
             self.shared.core.segment.notify();
         }
     }
 
-    /// All that was said of a publisher here until it asked was sent to those who read it.
+    /// Records that a publisher's fence passed: its readers were sent all earlier messages about the publisher.
     fn fence(&self, Fence { writer, number }: Fence) {
         let publisher = self.shared.state().endpoints.publishers.get(&writer).cloned();
         if let Some(publisher) = publisher {
             publisher.was_sent(number);
-            // Those who wait for acknowledgements.
+            // Wakes the threads that wait for acknowledgements.
             self.shared.core.segment.notify();
         }
     }
 
-    /// What the daemon told of and did not say again is over: it was unmatched while the session was
-    /// too slow to be told.
+    /// Ends the pairs that the daemon announced and did not repeat. They were unmatched while the session was too
+    /// slow to be told.
     fn drop_pairs(&mut self, over: &HashSet<Pair>) {
         let (publishers, subscriptions) = self.shared.state().endpoints.all();
         for publisher in publishers {
@@ -215,15 +215,15 @@ impl ControlThread {
         }
     }
 
-    /// Whether both are the session's own, which part as soon as one of them ends.
+    /// Returns whether both endpoints are the session's own. Such a pair ends as soon as one of the endpoints ends.
     fn is_own_pair(&self, pair: &Pair) -> bool {
         pair.reader.is_of(&self.shared.core.id) && pair.writer.is_of(&self.shared.core.id)
     }
 
-    /// Lets go of memory of others that nobody here reads any more, of which the daemon did not say
-    /// so as it does not know of it: it was given up while there was no daemon, or while this
-    /// session was too slow to be told. After everything has been `told` anew the daemon hears of
-    /// what is read, so that it will say when that is given up.
+    /// Releases memory of other sessions that no reader here uses any more, and whose end the daemon did not report.
+    /// The daemon does not know that the session holds it: the memory was given up while there was no daemon, or
+    /// while this session was too slow to be told. If everything was `told` anew, requests the memory that is still
+    /// read, so that the daemon will report its end.
     fn drop_unread(&mut self, told: bool) {
         let shared = self.shared.clone();
         let read = |writer: &Gid| {
@@ -242,7 +242,7 @@ impl ControlThread {
         self.ask(&pair);
     }
 
-    /// Asks a writer to serve a reader of ours, or repeats it.
+    /// Asks a writer to serve a reader of this session, or repeats the request.
     fn ask(&mut self, pair: &Pair) {
         let Some(subscription) =
             self.shared.state().endpoints.subscriptions.get(&pair.reader).cloned()
@@ -271,7 +271,8 @@ impl ControlThread {
             Err(error) => {
                 let topic = &subscription.endpoint.topic;
                 tracing::error!(topic, %error, "a publisher cannot be received from");
-                // For its status: the caller that waits for samples is on another host, where this is a gateway.
+                // The daemon shows this in its status: in a gateway, the caller that waits for samples is on another
+                // host.
                 let pair = Pair { reader: subscription.endpoint.gid, writer };
                 self.tell_failure(&pair, error.to_string());
             }
@@ -292,7 +293,7 @@ impl ControlThread {
             session: self.shared.core.id,
             stands_for: stands_for(subscription),
             segments: Vec::new(),
-            // The numbers of the others say nothing of what came before.
+            // Numbers that do not rise do not show which samples came before.
             after: after.filter(|_| subscription.rising),
             carries: subscription.carries.then_some(true),
         })
@@ -301,11 +302,11 @@ impl ControlThread {
     fn attach(&mut self, attach: Attach, descriptors: Vec<PassedFd>) {
         let pair = Pair { reader: attach.reader, writer: attach.writer };
         self.pairs.tell(pair);
-        // Counted whether or not it comes to anything, as the daemon does.
+        // The pair counts even if it is not attached, as in the daemon.
         let peer = self.hold(attach.session, pair, descriptors, &attach.segments);
         let shared = self.shared.clone();
         let own = attach.session == shared.core.id;
-        // Neither of two of our own shall end between the look at it and the grant.
+        // Two own endpoints must not end between the check and the grant.
         let own_pairs = own.then(|| shared.lock_own_pairs());
         let Some(publisher) = self.shared.state().endpoints.publishers.get(&attach.writer).cloned()
         else {
@@ -314,7 +315,7 @@ impl ControlThread {
         if own && !self.has_lane(&pair, attach.lane) {
             return;
         }
-        // Before it is served: what is published for it from then on waits for its grant to be sent.
+        // Before the reader is served: samples published for it from then on wait until its grant is sent.
         self.shared.core.memory.hands_over();
         let grant = peer.map_err(|e| e.to_string()).and_then(|peer| {
             let Attach { reader: gid, lane, qos, stands_for, after, carries, .. } = attach;
@@ -353,7 +354,7 @@ impl ControlThread {
         }
     }
 
-    /// Tells the daemon, which shows it, why a pair that it matched does not come about.
+    /// Reports to the daemon why a pair that it matched is not attached. The daemon shows the reason.
     fn tell_failure(&mut self, pair: &Pair, reason: String) {
         let Pair { reader, writer } = *pair;
         self.say(SessionMessage::Unmatch(Unmatch { reader, writer, reason }));
@@ -364,7 +365,7 @@ impl ControlThread {
         let Granted { after, relayed, .. } = granted;
         let pair = Pair { reader, writer };
         self.pairs.tell(pair);
-        // In a packet that is full not all of them were named.
+        // A full packet does not name all segments.
         let all = descriptors.len() < MAX_DESCRIPTORS;
         let peer = self.hold(session, pair, descriptors, &segments);
         if all {
@@ -386,8 +387,8 @@ impl ControlThread {
             Accept::Stands => return,
             Accept::AskAgain => {
                 pair_log::forgotten(&pair);
-                // Under the same lock: the lane of before is in use still, so this is another one,
-                // and what we ask is no repetition, which the daemon would not pass on.
+                // Under the same lock: the earlier lane is still in use, so this is another lane. The request is
+                // therefore not a repetition, which the daemon would not pass on.
                 let segment = &self.shared.core.segment;
                 let asking = matched_readers.lane_for(writer, || segment.allocate_lane());
                 drop(matched_readers);
@@ -407,7 +408,7 @@ impl ControlThread {
                 let linked = matches!(self.link, DaemonConnection::Socket(_));
                 let numbers = match subscription.endpoint.kind {
                     EndpointKind::Subscription if stands_in && linked => NumberKind::All,
-                    // In a relayed process what was lost on the way is said aloud.
+                    // In a relayed process, later losses on the way are reported explicitly.
                     EndpointKind::Subscription if stands_in => NumberKind::Between,
                     _ if subscription.keeps_all() => NumberKind::Since,
                     _ => NumberKind::None,
@@ -415,7 +416,7 @@ impl ControlThread {
                 subscription.lock().add(mapped, after, numbers);
                 drop(own_pairs);
                 self.matches.add_reader(&subscription);
-                // It may have history to take.
+                // The writer may have history to take.
                 self.shared.core.segment.notify();
             }
             Err(error) => {
@@ -436,21 +437,21 @@ impl ControlThread {
     ) -> Result<RingPeer, PeerError> {
         let held = self.peers.hold(session, pair, descriptors, segments);
         if matches!(held, Err(PeerError::Missing)) {
-            // The daemon takes us to hold what we do not: have it start over.
+            // The daemon assumes that the session holds descriptors that it lacks. A resync starts over.
             self.outbox.push_back((SessionMessage::Resync, Vec::new()));
         }
         if !segments.is_empty() {
-            // Those who wait for what is in them.
+            // Wakes the threads that wait for data in the segments.
             self.shared.core.segment.notify();
         }
         held
     }
 
-    /// Whether a subscription of this session has that lane for the writer. The daemon's message says where
-    /// lanes and rings are. Without this check it could name the bytes of one of this session's samples.
+    /// Returns whether a subscription of this session has that lane for the writer. The daemon's message gives the
+    /// locations of lanes and rings. Without this check, it could name the bytes of one of this session's samples.
     fn has_lane(&self, pair: &Pair, lane: Location) -> bool {
         let subscription = self.shared.state().endpoints.subscriptions.get(&pair.reader).cloned();
-        // It may have ended, with its lanes, since it asked.
+        // The subscription may have ended, with its lanes, since its request.
         let Some(subscription) = subscription else { return false };
         let has = subscription.lock().lanes().contains(&(pair.writer, lane));
         if !has {
@@ -462,7 +463,7 @@ impl ControlThread {
         has
     }
 
-    /// Whether a publisher of ours has that ring.
+    /// Returns whether a publisher of this session has that ring.
     fn has_ring(&self, writer: &Gid, ring: Location) -> bool {
         let publisher = self.shared.state().endpoints.publishers.get(writer).cloned();
         let Some(publisher) = publisher else { return false };
@@ -476,7 +477,7 @@ impl ControlThread {
     fn segment(&mut self, opened: &SegmentOpened, descriptors: &[PassedFd]) {
         if let [descriptor] = descriptors {
             self.peers.opened(&opened.session, opened.segment, descriptor);
-            // Those who wait for what is in it.
+            // Wakes the threads that wait for data in the segment.
             self.shared.core.segment.notify();
         }
     }

@@ -55,11 +55,12 @@ use crate::{
 const BATCH: usize = 64;
 /// Time between attempts of a process that ran out of file descriptors.
 const RETRY: Duration = Duration::from_secs(2);
-/// How long an ending session waits for a daemon whose socket is full.
+/// Maximum time that an ending session waits for a daemon whose socket is full.
 const FAREWELL: Duration = Duration::from_secs(1);
-/// How long an ending session stays for readers that have not taken up their grants from its publishers.
+/// Maximum time that an ending session stays for readers that have not taken up their grants from its
+/// publishers.
 const STAY: Duration = Duration::from_secs(if cfg!(test) { 60 } else { 1 });
-/// The most remote subscriptions that a relay announces by GID; one packet has no room for more.
+/// Maximum number of remote subscriptions that a relay announces by GID. One packet has no room for more.
 const MAX_STANDS_FOR: usize = 1024;
 
 /// The messages that wait to be sent to the daemon, with their descriptors.
@@ -80,7 +81,7 @@ pub(in crate::session) struct ControlThread {
     memory: AnnouncedMemory,
     timed: TimedEndpoints,
     pause: ReconnectPause,
-    /// When to request everything anew, after the process ran out of file descriptors.
+    /// The time to request everything again, after the process ran out of file descriptors.
     retry: Option<Instant>,
 }
 
@@ -90,7 +91,7 @@ pub(in crate::session) enum FirstPeer {
     Daemon(Connected),
     /// The process at the other end of a socket. The session has no other peer afterwards.
     Socket(Connected),
-    /// The registry of this process, where the session meets others of the process.
+    /// The registry of this process, which connects the sessions of the process.
     LocalRegistry(Arc<LocalRegistry>),
     /// No peer.
     Alone,
@@ -269,7 +270,7 @@ impl ControlThread {
         self.memory.announce(&mut self.outbox, &self.peers);
     }
 
-    /// Counts the pairs that changed, and reports them.
+    /// Counts the pairs that changed, and reports the changes.
     fn report_matches(&mut self) {
         self.matches.report(&mut self.graph, &mut self.timed);
     }
@@ -292,7 +293,7 @@ impl ControlThread {
         let state = shared.state();
         let queued = shared.core.link.take();
         if matches!(self.link, DaemonConnection::Reconnecting(_) | DaemonConnection::Ended) {
-            // The next daemon is sent everything from the state of that time.
+            // The next daemon is sent everything, from the state at that time.
             return;
         }
         for outgoing in queued {
@@ -440,7 +441,7 @@ impl ControlThread {
         self.shared.core.waker.take();
     }
 
-    /// Wakes the threads that wait if the time for it has come. Returns when it comes next.
+    /// Wakes the waiting threads if their time has come. Returns the next such time.
     fn look_again(&self) -> Option<Instant> {
         let (due, next) = self.shared.core.listening.take_due(Instant::now());
         if due {
@@ -477,7 +478,8 @@ impl ControlThread {
                 Ok(received) => self.handle(received.message, received.descriptors),
                 Err(SocketError::NotReady) => return,
                 Err(error @ SocketError::NoDescriptors) => {
-                    // Others would have to match anew what a new connection has it announce.
+                    // After a new connection, this session would announce all endpoints again, and others
+                    // would have to match them again.
                     tracing::error!(
                         %error,
                         "lost a daemon message: out of file descriptors; requesting it again in {RETRY:?}"

@@ -3,7 +3,7 @@
 
 use crate::wire::session::Pair;
 
-/// What it is logged under.
+/// The target of the log lines.
 const TARGET: &str = "axon_transport::pairs";
 
 /// Writer: a reader is served from position `first` on.
@@ -18,19 +18,19 @@ pub(super) fn accepted(pair: &Pair, generation: u64, first: u64) {
     tracing::debug!(target: TARGET, %reader, %writer, generation, first, "accepted");
 }
 
-/// Reader: the writer granted anew, so it had forgotten the reader.
+/// Reader: the writer granted again, because it had forgotten the reader.
 pub(super) fn forgotten(pair: &Pair) {
     let Pair { reader, writer } = pair;
     tracing::debug!(target: TARGET, %reader, %writer, "the writer had forgotten the reader");
 }
 
-/// Reader: the writer has ended, and what it granted never came.
+/// Reader: the writer ended, and its grant never arrived.
 pub(super) fn unmet(pair: &Pair, samples: u64) {
     let Pair { reader, writer } = pair;
     tracing::debug!(target: TARGET, %reader, %writer, samples, "unmet");
 }
 
-/// Either end lets go of the other.
+/// Reader or writer: the pair was removed.
 pub(super) fn over(pair: &Pair, why: &str) {
     let Pair { reader, writer } = pair;
     tracing::debug!(target: TARGET, %reader, %writer, why, "over");

@@ -1,17 +1,17 @@
-//! How long a session that lost its daemon waits before it looks for the next one.
+//! The pause of a session between the loss of its daemon and the search for the next one.
 
 use std::time::{Duration, Instant};
 
 const MIN_PAUSE: Duration = Duration::from_millis(100);
 const MAX_PAUSE: Duration = Duration::from_secs(2);
-/// A connection that lasted less was as good as refused.
+/// Minimum duration of a connection. A shorter one counts as refused.
 const MIN_CONNECTION_TIME: Duration = Duration::from_secs(1);
 
-/// The pause before the search for a daemon: a connection that does not last is not made again at once, at the cost of
-/// all other sessions.
+/// The pause before the search for a daemon. It keeps a session whose connections do not last from
+/// reconnecting at once, at the cost of all other sessions.
 #[derive(Debug)]
 pub(super) struct ReconnectPause {
-    /// When the last connection was made.
+    /// The time of the last connection.
     since: Instant,
     pause: Duration,
 }
@@ -25,7 +25,7 @@ impl ReconnectPause {
         self.since = now;
     }
 
-    /// Returns how long the search waits.
+    /// Returns the pause before the search.
     pub(super) fn handle_lost(&mut self, now: Instant) -> Duration {
         self.pause = if now.saturating_duration_since(self.since) < MIN_CONNECTION_TIME {
             next(self.pause)
@@ -36,7 +36,7 @@ impl ReconnectPause {
     }
 }
 
-/// The pause after another one in which no daemon was found.
+/// Returns the pause after another pause in which no daemon was found.
 pub(super) fn next(pause: Duration) -> Duration {
     (pause * 2).clamp(MIN_PAUSE, MAX_PAUSE)
 }

@@ -34,22 +34,22 @@ pub(super) struct Peers {
     news: Arc<MemoryChanges>,
     peers: HashMap<SessionId, Entry>,
     held: PairRefs,
-    /// An epoll instance of their pidfds: with hundreds of them, looking at each whenever anything
-    /// happens would be most of what there is to do.
+    /// An epoll instance of the peers' pidfds. With hundreds of peers, checking each of them at every event would be
+    /// most of the work.
     deaths: Arc<OwnedFd>,
 }
 
-/// Ends of processes that are looked at together; those behind them are not forgotten.
+/// Maximum number of ended processes per check. The next check reports the others.
 const DEATHS: usize = 64;
 
 struct Entry {
     session: Arc<PeerSession>,
-    /// Where its process's death is seen.
+    /// The epoll instance that reports the death of the process.
     deaths: Arc<OwnedFd>,
-    /// Its process has ended. What the daemon took from it before may still come.
+    /// True if the process has ended. Memory that the daemon took from it before may still arrive.
     dead: bool,
-    /// The segments that came or were named since the daemon began to tell everything: of others it
-    /// does not know that they are here, so it will not say when they are gone.
+    /// Segments that arrived or were named since the daemon began to announce everything. The daemon does not know
+    /// that this session holds other segments, so it will not report their end.
     named: BTreeSet<u32>,
 }
 
@@ -61,19 +61,20 @@ impl Entry {
         Ok(Self { session, deaths: deaths.clone(), dead: false, named: BTreeSet::new() })
     }
 
-    /// Whether its process has ended, noted or not.
+    /// Returns whether the process has ended, recorded or not.
     fn is_dead(&self) -> bool {
         self.dead || self.session.is_dead()
     }
 
-    /// Notes the death of its process, of which the epoll instance would tell again and again.
+    /// Records the death of the process and stops watching it. Otherwise, the epoll instance would report the death
+    /// again and again.
     fn note_death(&mut self) {
         self.unwatch();
         self.dead = true;
     }
 
     fn unwatch(&self) {
-        // The pidfd may be in use for longer, here and in other processes, which share it.
+        // The pidfd may be in use for longer, here and in other processes that share it.
         if !self.dead {
             let _ = epoll::delete(&self.deaths, self.session.pidfd());
         }
@@ -94,12 +95,11 @@ impl Drop for Entry {
     }
 }
 
-/// For which pairs sessions are held: of thousands of pairs with hundreds of sessions one is over at a
-/// time.
+/// The pairs that hold each session. Of thousands of pairs with hundreds of sessions, one ends at a time.
 #[derive(Default)]
 struct PairRefs {
     pairs: BTreeSet<(Pair, SessionId)>,
-    /// How many of them each session has.
+    /// Number of pairs that hold each session.
     counts: HashMap<SessionId, usize>,
 }
 
@@ -110,7 +110,7 @@ impl PairRefs {
         }
     }
 
-    /// A pair is over. The sessions that are held for no other.
+    /// Removes a pair that ended. Returns the sessions that no other pair holds.
     fn release(&mut self, pair: &Pair) -> Vec<SessionId> {
         let [first, last] = [0, u8::MAX].map(|byte| (*pair, SessionId([byte; 16])));
         let over: Vec<_> = self.pairs.range(first..=last).copied().collect();
@@ -134,12 +134,12 @@ impl PairRefs {
     }
 }
 
-/// What tells sessions apart, nearly always.
+/// Returns a key that is almost always unique to a session.
 fn key(id: &SessionId) -> u64 {
     id.0.iter().take(8).fold(0, |key, byte| key << 8 | u64::from(*byte))
 }
 
-/// Why a peer session cannot be used.
+/// The reason why a peer session cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum PeerError {
     #[error("its descriptors did not come")]
@@ -154,8 +154,8 @@ impl Peers {
         Ok(Self { own, news, peers: HashMap::new(), held: PairRefs::default(), deaths })
     }
 
-    /// The session `id`, for `pair`, with the descriptors that came along, if any: those of its
-    /// introduction, and of `segments` of its memory.
+    /// Returns the session `id`, and holds it for `pair`. `descriptors` begins with those of the session's
+    /// introduction, if any, and ends with those of `segments` of its memory.
     pub(super) fn hold(
         &mut self,
         id: SessionId,
@@ -168,7 +168,7 @@ impl Peers {
         }
         let introduced = descriptors.len().saturating_sub(segments.len());
         let maps = descriptors.split_off(introduced);
-        // What stands in for a relayed session has that session's id, in whatever daemon it is.
+        // The stand-in for a relayed session has that session's id, in each daemon.
         let returned = introduced > 0 && self.peers.get(&id).is_some_and(Entry::is_dead);
         if returned || !self.peers.contains_key(&id) {
             let [segment, doorbell, pidfd] =
@@ -187,19 +187,19 @@ impl Peers {
         Ok(RingPeer::Remote(entry.session.clone()))
     }
 
-    /// The segments of a session that readers miss.
+    /// Takes the segments of a session that readers lack.
     pub(super) fn take_wanted(&self, id: &SessionId) -> BTreeSet<u32> {
         self.peers.get(id).map(|entry| entry.session.take_wanted()).unwrap_or_default()
     }
 
-    /// A session that is held has one segment more.
+    /// Adds a segment of a session that is held.
     pub(super) fn opened(&mut self, id: &SessionId, segment: Segment, descriptor: &PassedFd) {
         if let Some(entry) = self.peers.get_mut(id) {
             entry.add(segment, descriptor);
         }
     }
 
-    /// A session that is held has given a segment up.
+    /// Removes a segment that a held session gave up.
     pub(super) fn gone(&mut self, id: &SessionId, number: u32) {
         if let Some(entry) = self.peers.get_mut(id) {
             entry.named.remove(&number);
@@ -207,8 +207,7 @@ impl Peers {
         }
     }
 
-    /// Lets go of a session's memory for samples of `writer` that was not named, now that all of it
-    /// has been.
+    /// Releases a session's memory for samples of `writer` that was not named, now that all of it could be named.
     pub(super) fn drop_unnamed(&mut self, id: &SessionId, writer: Gid) {
         if let Some(Entry { session, named, .. }) = self.peers.get(id) {
             for SegmentInfo { number, kind } in session.segments() {
@@ -219,11 +218,10 @@ impl Peers {
         }
     }
 
-    /// Lets go of sessions that nobody has to do with, and of memory for samples that neither was
-    /// named nor is of a writer that is `read`. What of it is read though it was not named is
-    /// returned.
+    /// Releases sessions without users. Also releases memory for samples that was not named and whose writer is not
+    /// `read`. Returns the memory that was not named and is read.
     pub(super) fn drop_unread(&mut self, read: impl Fn(&Gid) -> bool) -> Vec<(SessionId, u32)> {
-        // Readers and publishers hold the sessions that they have to do with.
+        // Readers and publishers hold the sessions that they use.
         let held = &self.held;
         self.peers.retain(|id, e| held.holds(id) || Arc::strong_count(&e.session) > 1);
         let mut unnamed = Vec::new();
@@ -240,21 +238,22 @@ impl Peers {
         unnamed
     }
 
-    /// The daemon said that `pair` is over.
+    /// Releases a pair that the daemon ended.
     pub(super) fn release(&mut self, pair: &Pair) {
         for id in self.held.release(pair) {
             self.peers.remove(&id);
         }
     }
 
-    /// The daemon starts to count anew. What is mapped stays, for the pairs that it will repeat.
+    /// Restarts the count of pairs together with the daemon. Mapped memory stays, for the pairs that the daemon will
+    /// repeat.
     pub(super) fn recount(&mut self) {
         self.held = PairRefs::default();
         self.peers.values_mut().for_each(|entry| entry.named.clear());
     }
 
-    /// Notes which sessions' process has ended; whether there are any more. They stay until the daemon
-    /// has said that their pairs are over: memory that it took from them before may come until then.
+    /// Records the sessions whose process has ended. Returns whether there are new ones. A session stays until the
+    /// daemon has ended its pairs: memory that the daemon took from it before may arrive until then.
     pub(super) fn note_deaths(&mut self) -> bool {
         let mut events = [MaybeUninit::<epoll::Event>::uninit(); DEATHS];
         let now = Timespec::default();
@@ -275,7 +274,7 @@ impl Peers {
         died
     }
 
-    /// Readable once the process of one of them has ended.
+    /// Returns a descriptor that is readable once the process of a peer has ended.
     pub(super) fn deaths(&self) -> BorrowedFd<'_> {
         self.deaths.as_fd()
     }

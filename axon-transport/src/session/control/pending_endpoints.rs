@@ -1,8 +1,8 @@
 //! Remote endpoints that the graph does not show yet. An endpoint appears once its pairs with the session's own
 //! endpoints are attached, so that a counted endpoint can be reached.
 //!
-//! Plain data. An endpoint is delayed for [`ARRIVAL_TIMEOUT`] at most: a stopped process must not hide endpoints from
-//! other processes.
+//! This module does no I/O. An endpoint is delayed for at most [`ARRIVAL_TIMEOUT`]: a stopped process must not hide
+//! endpoints from other processes.
 
 use std::{
     collections::{BTreeSet, HashMap},
@@ -11,14 +11,13 @@ use std::{
 
 use crate::{graph::GraphEntry, ids::Gid, wire::session::Pair};
 
-/// How long an endpoint is held back at most.
+/// Maximum delay of an endpoint.
 pub(in crate::session) const ARRIVAL_TIMEOUT: Duration = Duration::from_secs(1);
 
 #[derive(Default)]
 pub(super) struct PendingEndpoints {
     arriving: HashMap<Gid, PendingEndpoint>,
-    /// Until when those were to be held back that were arriving when everything began to be told
-    /// anew.
+    /// End of the delay of each endpoint that was pending when the last full graph began.
     before: HashMap<Gid, Instant>,
 }
 
@@ -29,19 +28,19 @@ struct PendingEndpoint {
 }
 
 impl PendingEndpoints {
-    /// Holds `entry` back until the pairs in `missing` stand.
+    /// Delays `entry` until the pairs in `missing` are attached.
     pub(super) fn hold(&mut self, entry: GraphEntry, missing: BTreeSet<Pair>, now: Instant) {
         let gid = entry.endpoint.gid;
         let until = self.before.remove(&gid).unwrap_or(now + ARRIVAL_TIMEOUT);
         self.arriving.insert(gid, PendingEndpoint { entry, missing, until });
     }
 
-    /// Those that are held back.
+    /// Returns the pending endpoints.
     pub(super) fn entries(&self) -> impl Iterator<Item = &GraphEntry> {
         self.arriving.values().map(|arriving| &arriving.entry)
     }
 
-    /// A pair stands. The endpoint that waited for it and for no other.
+    /// Records that a pair is attached. Returns the endpoint that waited for it and for no other.
     pub(super) fn pair_up(&mut self, pair: &Pair) -> Option<GraphEntry> {
         [pair.reader, pair.writer].iter().find_map(|gid| {
             let arriving = self.arriving.get_mut(gid)?;
@@ -51,12 +50,12 @@ impl PendingEndpoints {
         })
     }
 
-    /// An endpoint is gone before it arrived.
+    /// Removes an endpoint that ended while it was pending.
     pub(super) fn remove(&mut self, gid: &Gid) -> Option<GraphEntry> {
         self.arriving.remove(gid).map(|arriving| arriving.entry)
     }
 
-    /// An endpoint of the session's own is gone. Those that waited for nothing else.
+    /// Removes the pairs of an own endpoint that ended. Returns the endpoints that waited for nothing else.
     pub(super) fn own_gone(&mut self, own: &Gid) -> Vec<GraphEntry> {
         self.take_where(|arriving| {
             arriving.missing.retain(|pair| pair.reader != *own && pair.writer != *own);
@@ -64,7 +63,7 @@ impl PendingEndpoints {
         })
     }
 
-    /// Those that have been held back for long enough.
+    /// Removes and returns the endpoints whose delay is over.
     pub(super) fn overdue(&mut self, now: Instant) -> Vec<GraphEntry> {
         if self.due().is_none_or(|due| due > now) {
             return Vec::new();
@@ -72,12 +71,12 @@ impl PendingEndpoints {
         self.take_where(|arriving| arriving.until <= now)
     }
 
-    /// When the next one has been.
+    /// Returns the time at which the next delay ends.
     pub(super) fn due(&self) -> Option<Instant> {
         self.arriving.values().map(|arriving| arriving.until).min()
     }
 
-    /// Everything is told anew: an endpoint that is not told again is gone.
+    /// Begins a full graph. An endpoint that the daemon does not repeat is gone.
     pub(super) fn restart(&mut self) {
         let arriving = std::mem::take(&mut self.arriving);
         self.before = arriving.into_iter().map(|(gid, arriving)| (gid, arriving.until)).collect();
@@ -138,7 +137,7 @@ mod tests {
         assert_eq!(arrivals.due(), Some(now + ARRIVAL_TIMEOUT));
         assert!(arrivals.overdue(now).is_empty());
         assert_eq!(shown(arrivals.overdue(now + ARRIVAL_TIMEOUT)), [gid(8)]);
-        // Being told of it again and again makes it no longer.
+        // A repeated announcement does not extend the delay.
         arrivals.restart();
         assert!(arrivals.due().is_none());
         arrivals.hold(entry(9), [pair(1, 9)].into(), now + ARRIVAL_TIMEOUT);

@@ -1,4 +1,4 @@
-//! The search for a daemon, on a thread of its own: meanwhile peers may die.
+//! The search for a daemon. It has a thread of its own, because peers may die meanwhile.
 
 use std::{
     sync::{
@@ -16,14 +16,14 @@ use crate::session::{
     error::SessionError,
 };
 
-/// A search that is under way. Dropping this ends it.
+/// A running search. Dropping it ends the search.
 pub(super) struct Search {
     found: Receiver<Connected>,
     over: Arc<AtomicBool>,
 }
 
 impl Search {
-    /// Begins one after a pause. `None` without a thread to search with.
+    /// Begins a search after a pause. Returns `None` if no thread can be started.
     pub(super) fn begin(core: Arc<SessionCore>, first: Duration) -> Option<Self> {
         let (found, receiver) = sync_channel(1);
         let over = Arc::new(AtomicBool::new(false));
@@ -61,10 +61,10 @@ impl Search {
         }
     }
 
-    /// The daemon that was found, if one was.
+    /// Returns the daemon that was found.
     ///
     /// # Errors
-    /// As a channel's: none yet, or the search has failed.
+    /// The error of a channel: no daemon yet, or the search has failed.
     pub(super) fn try_found(&self) -> Result<Connected, TryRecvError> {
         self.found.try_recv()
     }

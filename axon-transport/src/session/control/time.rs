@@ -9,7 +9,7 @@ pub(super) struct TimedEndpoints {
     shared: Arc<SessionShared>,
     /// The endpoints; `None` if the list must be rebuilt.
     endpoints: Option<Vec<EventSource>>,
-    /// When to check them, in nanoseconds of the monotonic clock.
+    /// The time of the next check, in nanoseconds of the monotonic clock.
     due: Option<u64>,
 }
 

@@ -75,7 +75,7 @@ pub(super) fn done(daemon: &Daemon, asking: &Subscription) {
 }
 
 #[test]
-fn a_pair_stands_though_a_new_daemon_that_tells_all_again_does_not_know_of_it_yet() {
+fn pair_survives_a_resync_from_a_new_daemon() {
     let stage = Stage::new();
     let (session, daemon) = stage.session();
     let far = Far::new(&daemon);
@@ -193,18 +193,17 @@ fn a_grant_is_lost(session_ends: bool) {
 }
 
 #[test]
-fn a_publisher_that_is_dropped_without_a_daemon_stays_for_a_reader_that_was_not_told_of_its_grant()
-{
+fn dropped_publisher_waits_for_a_reader_without_its_grant_while_no_daemon_runs() {
     a_grant_is_lost(false);
 }
 
 #[test]
-fn a_session_that_ends_without_a_daemon_stays_for_a_reader_that_was_not_told_of_its_grant() {
+fn ended_session_waits_for_a_reader_without_its_grant_while_no_daemon_runs() {
     a_grant_is_lost(true);
 }
 
 #[test]
-fn a_publisher_that_is_dropped_goes_at_once_where_its_reader_has_taken_up_its_grant() {
+fn dropped_publisher_ends_at_once_after_its_reader_took_the_grant() {
     let stage = Stage::new();
     let (session, daemon) = stage.session();
     let publisher =

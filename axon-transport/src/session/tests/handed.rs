@@ -20,7 +20,7 @@ fn hear_fence(daemon: &Daemon) -> (Fence, bool) {
 }
 
 #[test]
-fn a_sample_is_handed_over_when_its_reader_was_sent_the_memory_that_it_is_in() {
+fn sample_is_delivered_after_its_segment() {
     let (session, daemon) = session();
     let spec = EndpointSpec::new("/p", "test/Bytes", Qos::keep_all());
     let publisher = session.create_publisher(spec).unwrap();

@@ -353,7 +353,7 @@ fn a_publisher_that_goes_on_since_its_relay_left_has_no_acknowledgement() {
 }
 
 #[test]
-fn a_sample_that_its_relay_gave_up_is_never_acknowledged_before_the_daemon_says_so() {
+fn given_up_sample_of_a_relay_is_acknowledged_after_the_report_of_the_daemon() {
     let (relayed, mut taking) = Relayed::with_receipts();
     let publisher = &relayed.publisher;
     relayed.three(&mut taking);

@@ -194,7 +194,7 @@ fn an_egress_limit_slows_samples_and_loses_none() {
 
 /// `max_hz` is of `[[topic]]`, in the settings' file of the host that sends.
 #[test]
-fn a_topic_crosses_as_often_as_its_max_hz_says_and_the_daemon_follows_the_file() {
+fn topic_crosses_at_max_hz_and_a_reload_changes_it() {
     let [mut robot, mut base] = Plan::new([classic(&[]), classic(&[])]).prepare();
     let file = robot.dir.path().join("axon.toml");
     let write = |hz: &str| {

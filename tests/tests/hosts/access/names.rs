@@ -48,7 +48,7 @@ fn asked(
 }
 
 #[test]
-fn a_certificate_of_two_names_has_the_rights_of_the_one_that_it_goes_by() {
+fn certificate_with_two_names_gets_the_rights_of_the_selected_name() {
     const RULES: &str = "default = \"deny\"\n\
         [[allow]]\npeer = \"base\"\npublish = [\"/cmd_vel\", \"/status\"]\n\
         [[allow]]\npeer = \"guest\"\npublish = \"/status\"";

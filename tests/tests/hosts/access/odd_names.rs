@@ -135,7 +135,7 @@ fn a_name_that_looks_like_one_that_rules_permit_is_another_name() {
 }
 
 #[test]
-fn names_that_are_too_long_end_the_link_that_they_come_over_and_no_other() {
+fn too_long_names_end_their_link_and_no_other() {
     let camera = Camera::under(RULES);
     let session = camera.a.session("robot");
     let reads = subscription(&session, "/cmd_vel");

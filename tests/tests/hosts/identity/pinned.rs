@@ -129,7 +129,7 @@ fn a_pin_that_is_removed_ends_the_link_and_the_next_dial() {
 }
 
 #[test]
-fn a_pin_that_ends_says_its_last_day_to_the_link_and_to_the_next_dial() {
+fn expired_pin_ends_the_link_and_the_next_dial_with_its_date() {
     let dir = tempfile::tempdir().unwrap();
     let hosts = Plan::new(pinned(dir.path(), EACH_OTHER)).start();
     let trust = trust_of(dir.path(), 0);

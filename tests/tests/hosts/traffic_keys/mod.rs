@@ -210,7 +210,7 @@ fn keys_of_a_link_that_ended_are_nowhere_in_the_daemon_with_aes() {
 }
 
 #[test]
-fn keys_of_a_link_with_a_pinned_peer_that_ended_are_nowhere_in_the_daemon() {
+fn keys_of_an_ended_link_with_a_pinned_peer_are_erased() {
     of_links(Auth::Pinned, Cipher::default());
 }
 

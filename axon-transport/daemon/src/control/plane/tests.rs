@@ -42,7 +42,7 @@ fn told(control: &mut ControlPlane) -> usize {
 }
 
 #[test]
-fn a_gateway_that_ended_leaves_no_refused_route_and_sessions_are_told_by_the_next() {
+fn ended_gateway_clears_refused_routes() {
     let mut control = control();
     let (role, name) = (SessionRole::Application, String::new());
     control.registry.handle_connect(SESSION, role, name, 1, None, None).unwrap();

@@ -15,7 +15,7 @@ use crate::{
     wire::beacon::{Beacon, Datagram, PROTOCOLS},
 };
 
-/// The first beacons, when all is new.
+/// Times of the first beacons after a change of this daemon or its network.
 const BURST: [Duration; 5] = [
     Duration::ZERO,
     Duration::from_millis(200),
@@ -25,11 +25,11 @@ const BURST: [Duration; 5] = [
 ];
 const INTERVAL_LEAST: Duration = Duration::from_secs(10);
 const INTERVAL_PER_HOST: Duration = Duration::from_millis(250);
-/// Most hosts that count without anything being known of them but a beacon.
+/// Most hosts known by beacons alone that count towards the beacon interval.
 const MOST_HEARD_COUNT: usize = 32;
 
 impl PeerDiscovery {
-    /// This daemon ends: tells those who would otherwise dial it.
+    /// Sends a goodbye, because this daemon ends: other daemons would otherwise dial it.
     pub(crate) fn say_goodbye(&mut self) {
         if self.port.is_none() || self.local.range == DiscoveryRange::Off {
             return;
@@ -40,7 +40,7 @@ impl PeerDiscovery {
     }
 
     pub(super) fn interval(&self) -> Duration {
-        // Anybody can make up as many as there are records: few of them count.
+        // Any host can forge beacons under many ids, up to the limit of records: only a few of those count.
         let linked = self.records.values().filter(|record| record.linked).count();
         let others = || self.records.values().filter(|record| !record.linked);
         // An address that answers under many ids is one host.
@@ -52,12 +52,12 @@ impl PeerDiscovery {
         INTERVAL_LEAST.max(INTERVAL_PER_HOST.saturating_mul(hosts))
     }
 
-    /// How long a peer may be silent: five beacons, each as late as it may be.
+    /// Returns the longest silence of a live peer: five beacons, each as late as it may be.
     pub(super) fn lifetime(&self) -> Duration {
         self.interval().mul_f64(6.25)
     }
 
-    /// Whether there is anybody to tell of this daemon.
+    /// Returns whether this daemon sends beacons.
     pub(super) fn announces(&self) -> bool {
         self.port.is_some()
             && match self.local.range {
@@ -93,8 +93,8 @@ impl PeerDiscovery {
         self.announce(&bytes);
     }
 
-    /// Sends to all who may listen: the QUIC ports of listed peers, and in SUBNET the group and the
-    /// QUIC ports of this host, where the group may not be reached.
+    /// Sends to every address where a daemon may listen: the QUIC ports of listed peers, and in SUBNET the group and
+    /// the QUIC ports of this host, where the group may not be reached.
     fn announce(&mut self, bytes: &[u8]) {
         let mut targets = Vec::new();
         if self.local.range == DiscoveryRange::Subnet {
@@ -119,7 +119,7 @@ impl PeerDiscovery {
         }
     }
 
-    /// Whether our own QUIC socket listens at `address`.
+    /// Returns whether this daemon's QUIC socket listens at `address`.
     fn is_own(&self, address: IpAddr) -> bool {
         if self.here.bind.is_empty() {
             self.here.is_local(address)

@@ -7,7 +7,7 @@ use crate::discovery::Interface;
 /// Most addresses in one dial.
 const MAX_DIAL_ADDRESSES: usize = 8;
 
-/// What this host's addresses say about others.
+/// The addresses of this host, which decide the addresses that it can reach.
 #[derive(Debug, Default)]
 pub(super) struct LocalAddresses {
     /// `AXON_BIND_ADDRS`; empty means every address.
@@ -16,12 +16,12 @@ pub(super) struct LocalAddresses {
 }
 
 impl LocalAddresses {
-    /// Whether `address` leads to this host.
+    /// Returns whether `address` leads to this host.
     pub(super) fn is_local(&self, address: IpAddr) -> bool {
         address.is_loopback() || self.interfaces.iter().any(|i| i.address == address)
     }
 
-    /// Whether a socket bound as configured can send to `address`.
+    /// Returns whether a socket that is bound as configured can send to `address`.
     pub(super) fn can_reach(&self, address: IpAddr) -> bool {
         self.bind.is_empty()
             || self.bind.iter().any(|bound| {
@@ -37,9 +37,9 @@ impl LocalAddresses {
         self.interfaces.iter().any(|i| i.contains(address))
     }
 
-    /// The addresses to dial: where beacons came from, then what the peer advertises on the same
-    /// subnets, then the rest. Of an unlisted peer an address on another subnet than its beacon's
-    /// source does not count: anybody can write one there.
+    /// Returns the addresses to dial: first the sources of beacons, then the peer's advertised addresses on the same
+    /// subnets, then the rest. For an unlisted peer, an address on another subnet than its beacon's source is ignored,
+    /// because any host can write such an address into a beacon.
     pub(super) fn candidates(
         &self,
         sources: &[SocketAddr],
@@ -68,7 +68,7 @@ impl LocalAddresses {
         candidates
     }
 
-    /// What a beacon of ours says about addresses: at most four that mean something elsewhere.
+    /// Returns the addresses for this daemon's beacons: at most four that other hosts can use.
     pub(super) fn advertised(&self) -> Vec<IpAddr> {
         let usable = |i: &&Interface| {
             let link_local = matches!(i.address, IpAddr::V6(v6) if v6.is_unicast_link_local());
@@ -77,7 +77,7 @@ impl LocalAddresses {
         };
         let all: Vec<&Interface> = self.interfaces.iter().filter(usable).collect();
         let real: Vec<&Interface> = all.iter().copied().filter(|i| !i.is_virtual()).collect();
-        // A container has nothing but a virtual interface.
+        // A container has only a virtual interface.
         let chosen = if real.is_empty() { all } else { real };
         let mut addresses: Vec<IpAddr> = chosen.iter().map(|i| i.address).collect();
         if addresses.is_empty() {

@@ -10,19 +10,19 @@ use crate::discovery::{AddressConfidence, DiscoveryAction};
 
 /// Most dials at once.
 pub(super) const MOST_IN_FLIGHT: usize = 8;
-/// Most dials at once to addresses of this standing and of worse ones together: the rest is kept
-/// for better ones.
+/// Most dials at once to addresses of this standing and of worse ones together. The remaining dials are reserved for
+/// better standings.
 const MOST_DOWN_FROM: [usize; AddressConfidence::COUNT] = [MOST_IN_FLIGHT, 7, 6, 5, 3];
 /// Most dials at once of one standing to one host.
 const MOST_OF_A_HOST: usize = 2;
-/// The side that is to dial first gets this much of a start.
+/// Head start of the side that is to dial first.
 const SECOND_DIAL: Duration = Duration::from_millis(300);
 
-/// The dials that are under way.
+/// The dials in flight.
 pub(super) struct InFlight(Vec<(AddressConfidence, Option<IpAddr>)>);
 
 impl InFlight {
-    /// Whether one more of this standing, to this host, is within the bounds.
+    /// Returns whether one more dial of this standing to this host is within the limits.
     pub(super) fn has_room(&self, standing: AddressConfidence, host: Option<IpAddr>) -> bool {
         let down_from = |best: usize| self.0.iter().filter(|(s, _)| *s as usize >= best).count();
         let within = (0..=standing as usize).all(|best| down_from(best) < MOST_DOWN_FROM[best]);
@@ -76,9 +76,8 @@ impl PeerDiscovery {
         }
     }
 
-    /// Dials those that are due: the best standing first, and of one standing those first whose host
-    /// has the fewest dials under way. A peer that has to wait is asked whether it is there, which
-    /// gives it a better standing if it is.
+    /// Dials the peers whose dial is due: the best standing first. Within one standing, peers whose host has the fewest
+    /// dials in flight come first. A peer that has to wait is probed; an answer gives it a better standing.
     pub(super) fn dial_due(&mut self, now: Duration) {
         let mut in_flight = self.dials_in_flight();
         let mut due = Vec::new();
@@ -94,7 +93,7 @@ impl PeerDiscovery {
         }
         due.sort_unstable();
         for (standing, _, _, daemon, host) in due {
-            // A better address of it may be the same, and is being dialled by now.
+            // A better address of the peer may be the same, and its dial may have started by now.
             let wants = self.records.get(&daemon).is_some_and(|r| self.wants_dial(r, standing));
             if !wants {
                 continue;
@@ -107,7 +106,7 @@ impl PeerDiscovery {
         }
     }
 
-    /// Whether a dial is under way now.
+    /// Starts a dial. Returns whether it is in flight now.
     fn dial(&mut self, now: Duration, daemon: DaemonId, standing: AddressConfidence) -> bool {
         let jitter = self.random.random_range(0.5..1.5);
         let Some(record) = self.records.get_mut(&daemon) else { return false };

@@ -14,17 +14,17 @@ const LEAST_HEARD: usize = 64;
 /// Most hosts that are remembered for an earlier link.
 const MOST_MET: usize = 128;
 
-/// Records that are chosen at a time to be dropped.
+/// Records that are chosen for eviction at a time.
 const CHOSEN: usize = 16;
 
-/// Records that are dropped for new ones. To choose one takes a look at all, so some are chosen at a time.
+/// Records to evict for new ones. The choice looks at all records, so several are chosen at a time.
 #[derive(Debug, Default)]
 pub(super) struct EvictionCandidates {
-    /// The last one goes first. Each with when it was last heard of.
+    /// The chosen records, the last one is evicted first. Each with the time when its daemon was last heard.
     chosen: Vec<(DaemonId, Duration)>,
-    /// Whether they are known by beacons alone.
+    /// True if the chosen daemons are known by beacons alone.
     heard: bool,
-    /// How many records there were.
+    /// The number of records at the time of the choice.
     records: usize,
 }
 
@@ -32,11 +32,11 @@ pub(super) struct EvictionCandidates {
 #[derive(Default)]
 struct HostRecords {
     records: usize,
-    /// Those that may be dropped, the oldest last.
+    /// The records that may be evicted, the oldest last.
     candidates: Vec<(Reverse<Duration>, DaemonId)>,
 }
 
-/// Whether a daemon is known by beacons alone.
+/// Returns whether a daemon is known by beacons alone.
 fn is_heard(record: &DaemonRecord) -> bool {
     record.standing() == AddressConfidence::Heard
 }
@@ -48,11 +48,11 @@ impl PeerDiscovery {
         if self.records.contains_key(&daemon) {
             return;
         }
-        // Without so many there is room for each.
+        // Below this number there is room for each record.
         if self.records.len() < MOST_HEARD {
             return;
         }
-        // In a flood they are as full as when records were chosen for eviction.
+        // In a flood the records are as full as when records were chosen for eviction.
         let known = self.knows(from);
         if !known
             && self.records.len() >= self.eviction.records
@@ -74,20 +74,20 @@ impl PeerDiscovery {
         }
     }
 
-    /// The record that goes next.
+    /// Returns the next record to evict.
     fn next_to_evict(&mut self, heard_goes: bool) -> Option<DaemonId> {
         self.choose_to_evict(heard_goes);
         if let Some(victim) = self.chosen_for_eviction() {
             return Some(victim);
         }
-        // One whose peer was heard from goes last, whatever was forged under its address.
+        // A daemon that answered a probe is evicted last, whatever was forged under its address.
         let answered = self.records.iter().filter(|(_, record)| {
             record.may_be_forgotten() && is_heard(record) == heard_goes && record.has_answered()
         });
         answered.min_by_key(|(_, record)| record.last_seen).map(|(id, _)| *id)
     }
 
-    /// The next record that was chosen for eviction, unless something was heard of its daemon since.
+    /// Returns the next record that was chosen for eviction, unless its daemon was heard since.
     fn chosen_for_eviction(&mut self) -> Option<DaemonId> {
         while let Some((victim, seen)) = self.eviction.chosen.pop() {
             let still = |record: &DaemonRecord| {
@@ -128,12 +128,12 @@ impl PeerDiscovery {
             EvictionCandidates { chosen, heard: heard_goes, records: self.records.len() };
     }
 
-    /// Whether a peer at this address is listed, or one stood linked there.
+    /// Returns whether a peer at this address is listed, or was linked there before.
     pub(super) fn knows(&self, address: IpAddr) -> bool {
         self.lists(address) || self.met.contains(&address)
     }
 
-    /// A link stands with somebody there.
+    /// Records that a link with a peer at this address is up.
     pub(super) fn meet(&mut self, address: IpAddr) {
         self.met.retain(|met| *met != address);
         self.met.push_back(address);

@@ -7,18 +7,18 @@ use axon_transport::config::{Config, DiscoveryRange, QkdPeers, Security};
 
 use crate::wire::SecurityTerms;
 
-/// This daemon, as others are to see it and as it judges others.
+/// This daemon's data for its own beacons and for its checks of other daemons.
 #[derive(Clone, Debug)]
 pub(crate) struct LocalDaemon {
-    /// Its id.
+    /// The daemon id.
     pub daemon: DaemonId,
     /// `ROS_DOMAIN_ID`.
     pub domain: u32,
-    /// Its security settings.
+    /// The security settings.
     pub terms: SecurityTerms,
-    /// In qkd its SAE ID and those it accepts.
+    /// This daemon's SAE ID and the accepted ones, in qkd.
     pub sae: Option<(String, QkdPeers)>,
-    /// How far it looks, at first.
+    /// The initial discovery range.
     pub range: DiscoveryRange,
     /// `AXON_BIND_ADDRS`.
     pub bind: Vec<IpAddr>,
@@ -27,7 +27,7 @@ pub(crate) struct LocalDaemon {
 }
 
 impl LocalDaemon {
-    /// The daemon that `config` describes.
+    /// Returns the daemon that `config` describes.
     pub(crate) fn of(config: &Config, daemon: DaemonId) -> Self {
         let sae = match &config.security {
             Security::Classic(_) => None,
@@ -38,7 +38,7 @@ impl LocalDaemon {
             domain: config.domain,
             terms: SecurityTerms::of(config),
             sae,
-            // Sessions say more: `Peers::set_range`.
+            // Sessions may extend the range: `Peers::set_range`.
             range: DiscoveryRange::Off,
             bind: config.bind_addrs.clone(),
             advertise: config.advertise_addrs.clone(),

@@ -1,7 +1,7 @@
-//! Discovery's state machine (`docs/architecture.md`): decides which daemons exist and when to dial them. Datagrams
-//! and events of links go in, datagrams and dials come out.
+//! Discovery's state machine (`docs/architecture.md`): decides which daemons exist and when to dial them. Its inputs
+//! are datagrams and events of links; its outputs are datagrams and dials.
 //!
-//! Anybody can send a beacon, so a beacon is only a hint. Every collection is bounded, and every answer is
+//! Any host can send a beacon, so a beacon is only a hint. Every collection is bounded, and every answer is
 //! rate-limited. No received datagram closes a link, or prevents a link to a peer that was acceptable before.
 
 mod announcing;
@@ -44,21 +44,21 @@ const MOST_UNAUTHENTICATED: usize = 256;
 /// Most addresses of listed peers.
 const MOST_LISTED: usize = 128;
 
-/// How a datagram came.
+/// The socket at which a datagram arrived.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Arrival {
-    /// To the shared port, by multicast or broadcast.
+    /// The shared port, by multicast or broadcast.
     Shared,
-    /// To our QUIC port alone: the sender lists us, answers us, or is on this host.
+    /// This daemon's QUIC port: the sender lists this host, answers it, or is on this host.
     Quic,
 }
 
-/// What [`PeerDiscovery`] wants done.
+/// An output of [`PeerDiscovery`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum PeersOutput {
-    /// To the group, on every interface.
+    /// A datagram to the group, on every interface.
     Multicast(Vec<u8>),
-    /// For the daemon.
+    /// An action of the daemon.
     Action(DiscoveryAction),
 }
 
@@ -73,23 +73,23 @@ pub(crate) struct PeerDiscovery {
     listed: Vec<(IpAddr, Option<u16>)>,
     port: Option<u16>,
     graph: u64,
-    /// When the next beacon goes, and how many of the burst are still to go.
+    /// The time of the next beacon, and the number of remaining beacons of the burst.
     next_beacon: Option<Duration>,
     burst_left: usize,
     answers: TokenBucket,
-    /// For those at addresses that this host knows.
+    /// Answers to addresses that this host knows.
     known_answers: TokenBucket,
     echoes: TokenBucket,
     known_echoes: TokenBucket,
-    /// Beacons and goodbyes that are looked at, of strangers and of hosts that this one knows.
+    /// Beacons and goodbyes that are processed, from unknown and from known hosts.
     heard: TokenBucket,
     known_heard: TokenBucket,
     probes: TokenBucket,
     known_probes: TokenBucket,
     asked: Probes,
-    /// When a dial became due since they were looked at.
+    /// The time at which a dial became due since the dials were last checked.
     dials_due: Option<Duration>,
-    /// Where links stood, the latest last.
+    /// Hosts of earlier links, the latest last.
     met: VecDeque<IpAddr>,
     reports: TokenBucket,
     random: StdRng,
@@ -97,7 +97,7 @@ pub(crate) struct PeerDiscovery {
 }
 
 impl PeerDiscovery {
-    /// A daemon that knows nobody. It is silent until its [QUIC port](Self::set_port) is known.
+    /// Creates discovery without records. It is silent until its [QUIC port](Self::set_port) is known.
     pub(crate) fn new(local: LocalDaemon, seed: u64) -> Self {
         let here = LocalAddresses { bind: local.bind.clone(), interfaces: Vec::new() };
         Self {
@@ -127,16 +127,16 @@ impl PeerDiscovery {
         }
     }
 
-    /// The next thing to do; ask until it says `None`.
+    /// Returns the next output, or `None` if there is none.
     pub(crate) fn poll_output(&mut self) -> Option<PeersOutput> {
-        // Once for all datagrams that came together.
+        // Once for all datagrams that arrived together.
         if let Some(now) = self.dials_due.take() {
             self.dial_due(now);
         }
         self.outputs.pop_front()
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) is to be called at the latest.
+    /// Returns the latest time for the next call of [`handle_timeout`](Self::handle_timeout).
     pub(crate) fn poll_timeout(&self) -> Option<Duration> {
         let in_flight = self.dials_in_flight();
         let lifetime = self.lifetime();
@@ -154,7 +154,7 @@ impl PeerDiscovery {
         of_records.chain(self.next_beacon).min()
     }
 
-    /// Does what is due at `now`.
+    /// Does the work that is due at `now`.
     pub(crate) fn handle_timeout(&mut self, now: Duration) {
         self.give_up_lost_dials(now);
         self.forget_silent(now);
@@ -171,15 +171,14 @@ impl PeerDiscovery {
         }
     }
 
-    /// The QUIC port is bound.
+    /// Sets the port to which the QUIC socket is bound.
     pub(crate) fn set_port(&mut self, now: Duration, port: u16) {
         if self.port.replace(port) != Some(port) {
             self.start_burst(now);
         }
     }
 
-    /// How far this daemon looks from now on. Links that stand are left alone: what goes over them is
-    /// decided for each pair.
+    /// Sets this daemon's discovery range. Existing links stay: the range is checked for each pair of endpoints.
     pub(crate) fn set_range(&mut self, now: Duration, range: DiscoveryRange) {
         let before = std::mem::replace(&mut self.local.range, range);
         if range > before {
@@ -189,7 +188,7 @@ impl PeerDiscovery {
             self.next_beacon = None;
         }
         if range < before {
-            // Those who still want this daemon say so to its QUIC port.
+            // Peers that still want this daemon send to its QUIC port.
             let unlinked = self.records.iter_mut().filter(|(_, record)| !record.linked);
             let far: Vec<DaemonId> = unlinked
                 .filter(|(_, record)| range == DiscoveryRange::Off || !record.listed)
@@ -207,7 +206,7 @@ impl PeerDiscovery {
         ids.into_iter().for_each(|id| self.schedule_dial(now, id));
     }
 
-    /// The interfaces of this host, whenever they were looked at.
+    /// Sets the interfaces of this host after each check.
     pub(crate) fn set_interfaces(&mut self, now: Duration, interfaces: Vec<Interface>) {
         if self.here.interfaces == interfaces {
             return;
@@ -221,7 +220,7 @@ impl PeerDiscovery {
         }
     }
 
-    /// The addresses of listed peers, names resolved.
+    /// Sets the addresses of listed peers, with names resolved.
     pub(crate) fn set_listed(&mut self, now: Duration, mut listed: Vec<(IpAddr, Option<u16>)>) {
         listed.truncate(MOST_LISTED);
         let new = listed.iter().any(|peer| !self.listed.contains(peer));
@@ -241,13 +240,13 @@ impl PeerDiscovery {
         }
     }
 
-    /// The digest of this daemon's graph, for the beacons to come.
+    /// Sets the digest of this daemon's graph for the next beacons.
     pub(crate) fn set_graph(&mut self, digest: u64) {
         self.graph = digest;
     }
 
-    /// A link with `daemon` stands, whichever side dialled it.
-    /// `proven`: the daemon proved that the id is its own. If not, another host may have the id: it is dialled all the same.
+    /// Handles a new link with `daemon`, which either side dialled. `proven`: the daemon proved that the id is its own.
+    /// If it did not, another host may have the id, and that host is dialled too.
     pub(crate) fn handle_link_up(
         &mut self,
         now: Duration,
@@ -272,14 +271,14 @@ impl PeerDiscovery {
         self.dial_due(now);
     }
 
-    /// The link with `daemon` is no more.
+    /// Handles the end of the link with `daemon`.
     pub(crate) fn handle_link_down(&mut self, now: Duration, daemon: DaemonId) {
         let Some(record) = self.records.get_mut(&daemon) else { return };
         (record.linked, record.cut) = (false, false);
         record.unproven = None;
         record.done();
         let left = record.left(now);
-        // One that dialled us and whose beacons never came cannot be dialled.
+        // A peer that dialled this host and whose beacons never arrived cannot be dialled.
         if !record.compatible {
             self.forget(daemon);
         } else if left {
@@ -290,7 +289,7 @@ impl PeerDiscovery {
         }
     }
 
-    /// A dial to addresses of this standing did not become a link.
+    /// Handles a failed dial to addresses of this standing.
     pub(crate) fn handle_dial_failed(
         &mut self,
         now: Duration,
@@ -312,7 +311,7 @@ impl PeerDiscovery {
         self.dial_due(now);
     }
 
-    /// Whether a dial would make sense, and the range lets this daemon look for the peer.
+    /// Returns whether a dial can succeed and the range permits this daemon to look for the peer.
     fn wants_dial(&self, record: &DaemonRecord, standing: AddressConfidence) -> bool {
         let in_range = match self.local.range {
             DiscoveryRange::Off => false,

@@ -18,34 +18,34 @@ use crate::{
     wire::beacon::Datagram,
 };
 
-/// Most probes whose answer is awaited.
+/// Most probes in flight.
 const MOST_ASKED: usize = 1024;
-/// Most of them to one host: beacons may be forged, and it hears so many within [`ANSWER_WITHIN`].
-/// Those to the [expected ports](PeerDiscovery::expects) of a known host come on top.
+/// Most probes in flight to one host: beacons may be forged, and this is the most that one host receives within
+/// [`ANSWER_WITHIN`]. Probes to the [expected ports](PeerDiscovery::expects) of a known host are not counted.
 const MOST_ASKED_OF_A_HOST: usize = 32;
-/// An address is probed at most this often, whatever daemons are said to be there.
+/// Minimum time between probes of one address, whatever daemons beacons claim there.
 const ASKED_AGAIN: Duration = Duration::from_millis(250);
-/// So long is an answer awaited.
+/// Timeout of a probe.
 pub(super) const ANSWER_WITHIN: Duration = Duration::from_secs(3);
 
-/// A probe whose answer is awaited.
+/// A probe in flight.
 #[derive(Debug)]
 pub(super) struct ProbeInFlight {
     at: Duration,
     nonce: [u8; 8],
     daemon: DaemonId,
     source: DialAddress,
-    /// It counts towards [`MOST_ASKED_OF_A_HOST`].
+    /// True if it counts towards [`MOST_ASKED_OF_A_HOST`].
     counts: bool,
-    /// Somebody answered: it is kept for [`ASKED_AGAIN`] alone.
+    /// The peer answered. The entry only enforces [`ASKED_AGAIN`].
     answered: bool,
 }
 
-/// The probes whose answers are awaited, the oldest first.
+/// The probes in flight, the oldest first.
 pub(super) type Probes = VecDeque<ProbeInFlight>;
 
 impl PeerDiscovery {
-    /// Asks the addresses of this standing that were not asked since their latest beacon.
+    /// Probes the addresses of this standing that were not probed since their latest beacon.
     pub(super) fn ask_whether_there(
         &mut self,
         now: Duration,
@@ -71,11 +71,11 @@ impl PeerDiscovery {
         }
     }
 
-    /// Probes an address, unless too many probes are under way or somebody answered there just now.
-    /// Whether an answer is awaited from there.
+    /// Probes an address, unless too many probes are in flight or a peer answered there just now. Returns whether an
+    /// answer from there is pending.
     fn ask(&mut self, now: Duration, daemon: DaemonId, source: DialAddress) -> bool {
         let to = source.address;
-        // The answer says which daemon is there, whichever was asked for.
+        // The answer names the daemon at the address, whichever daemon was asked for.
         let mut recent = self.asked.iter().rev().take_while(|asked| asked.at + ASKED_AGAIN > now);
         if let Some(recent) = recent.find(|asked| asked.source.address == to) {
             return !recent.answered;
@@ -107,14 +107,14 @@ impl PeerDiscovery {
         true
     }
 
-    /// Whether a daemon of this domain usually has this port, or one is listed there with it.
+    /// Returns whether daemons of this domain usually have this port, or a peer is listed there with it.
     fn expects(&self, address: SocketAddr) -> bool {
         let (ip, port) = (address.ip(), address.port());
         quic_ports(self.local.domain).contains(&port) || self.listed.contains(&(ip, Some(port)))
     }
 
-    /// The daemon said goodbye, or somebody did in its name. It is asked, and forgotten if it does not
-    /// answer in time. Where too many are asked the goodbye says nothing.
+    /// Handles a goodbye in the daemon's name, which another host may have sent. Probes the daemon, which is forgotten
+    /// if it does not answer in time. If too many probes are in flight, the goodbye is ignored.
     pub(super) fn leaves(&mut self, now: Duration, daemon: DaemonId) {
         let Some(record) = self.records.get(&daemon) else { return };
         let Some(best) = record.sources.first() else { return self.forget(daemon) };
@@ -130,8 +130,8 @@ impl PeerDiscovery {
         }
     }
 
-    /// The same, where the daemon is said to be elsewhere, too: addresses of this host of which there is
-    /// nothing but a beacon are asked, and forgotten if nobody answers there in time.
+    /// Like [`leaves`](Self::leaves), for a daemon that other hosts claim too. Probes the addresses on this host that
+    /// are known by beacons alone. An address is forgotten if no daemon answers there in time.
     pub(super) fn leaves_host(&mut self, now: Duration, daemon: DaemonId, host: IpAddr) {
         let Some(record) = self.records.get(&daemon) else { return };
         let heard =
@@ -146,8 +146,7 @@ impl PeerDiscovery {
         }
     }
 
-    /// An answer came: the address that was asked has a better standing, even if others were heard of
-    /// since.
+    /// Handles an answer: the probed address gets a better standing, even if the peer was heard at others since.
     pub(super) fn answered(
         &mut self,
         now: Duration,
@@ -165,7 +164,7 @@ impl PeerDiscovery {
         };
         let source = match asked.daemon == daemon {
             true => Some(asked.source.clone()),
-            // Another one was asked for there, and this one was heard of as well.
+            // The probe asked for another daemon, and beacons named this one there as well.
             false => record.sources.iter().find(|source| source.address == from).cloned(),
         };
         let Some(source) = source else { return };

@@ -16,11 +16,11 @@ use crate::{
     },
 };
 
-/// A peer is answered at most this often.
+/// Minimum time between two answers to a peer.
 const ANSWER_SPACING: Duration = Duration::from_secs(1);
 
 impl PeerDiscovery {
-    /// A datagram came.
+    /// Handles a received datagram.
     pub(crate) fn handle_datagram(
         &mut self,
         now: Duration,
@@ -78,7 +78,7 @@ impl PeerDiscovery {
         let difference = self.judge(&beacon);
         let observed = match arrival {
             Arrival::Shared => SocketAddr::new(from.ip(), beacon.port),
-            // A NAT's port, where one is between.
+            // A NAT's port, if a NAT is between.
             Arrival::Quic => from,
         };
         let known = self.knows(from.ip());
@@ -136,7 +136,7 @@ impl PeerDiscovery {
         self.differs(now, daemon, from, difference);
     }
 
-    /// Why the sender of `beacon` cannot be linked with, if it cannot.
+    /// Returns the setting that prevents a link with the beacon's sender, if any.
     fn judge(&self, beacon: &Beacon) -> Option<Difference> {
         if beacon.domain != self.local.domain {
             return Some(Difference {
@@ -178,7 +178,7 @@ impl PeerDiscovery {
 
     fn in_range(&self, from: SocketAddr, arrival: Arrival, theirs: bool, listed: bool) -> bool {
         let ours = self.local.range == DiscoveryRange::Localhost;
-        // Only who lists us, answers us or is on this host sends to our QUIC port.
+        // Only a daemon that lists this host, answers it or is on it sends to this host's QUIC port.
         let near = arrival == Arrival::Quic || listed || self.here.is_local(from.ip());
         near || !(ours || theirs)
     }
@@ -189,11 +189,11 @@ impl PeerDiscovery {
         if record.stays(now) || !record.sources.iter().any(|source| source.address.ip() == from) {
             return;
         }
-        // Where several addresses claim the id, one that leaves takes itself away and no other.
+        // If several addresses claim the id, a goodbye concerns its own address alone.
         let others = record.sources.iter().any(|source| source.address.ip() != from);
         let best = record.sources.first().is_some_and(|source| source.address.ip() == from);
         if record.linked {
-            // Where its path is cut it is looked for, and nobody can say for it that it leaves.
+            // While its path is cut, the peer is looked for, and no goodbye in its name counts.
             if !record.cut && (best || !others) {
                 record.leaving = Some(now);
             }
@@ -204,7 +204,7 @@ impl PeerDiscovery {
         }
     }
 
-    /// Asks whether the daemon is there, if beacons under its id came from elsewhere, too.
+    /// Probes the daemon if beacons under its id came from other addresses too.
     fn ask_if_contested(&mut self, now: Duration, daemon: DaemonId, address: SocketAddr) {
         let Some(record) = self.records.get(&daemon) else { return };
         let Some(source) = record.sources.iter().find(|source| source.address == address) else {
@@ -227,7 +227,7 @@ impl PeerDiscovery {
         }
         let answers = if known { &mut self.known_answers } else { &mut self.answers };
         if !answers.take(now) {
-            // Many ask at once: one beacon to all of them instead.
+            // Many daemons ask at once: one beacon to all of them instead.
             let soon = now + Duration::from_secs(1).mul_f64(self.random.random_range(0.5..1.0));
             self.next_beacon = self.next_beacon.map(|at| at.min(soon));
             return;

@@ -8,37 +8,37 @@ use std::{
 use super::probing::ANSWER_WITHIN;
 use crate::discovery::AddressConfidence;
 
-/// Most addresses of one standing that are kept of a peer.
+/// Most addresses of one standing in a peer's record.
 const MOST_SOURCES: usize = 4;
-/// A dial that nobody answered for is taken as failed after this.
+/// A dial without a reported outcome counts as failed after this time.
 const DIAL_FORGOTTEN: Duration = Duration::from_secs(30);
-/// Dials to one address are at least this far apart.
+/// Minimum time between dials to one address.
 const DIAL_SPACING: Duration = Duration::from_secs(1);
-/// A goodbye this shortly before a link goes down or a dial fails was meant.
+/// A goodbye counts if a link goes down or a dial fails at most this long after it.
 const GOODBYE_COUNTS: Duration = Duration::from_secs(10);
 const BACKOFF_FIRST: Duration = Duration::from_millis(250);
 const BACKOFF_MOST: Duration = Duration::from_secs(8);
-/// Where another host may have the id of a linked one, it is dialled again after this.
+/// Pause until the next dial, if another host may have the id of a linked peer.
 const DOUBT_AGAIN: Duration = Duration::from_secs(30);
-/// Most addresses at which a peer was found that proves nothing.
+/// Most addresses of a peer that does not prove its id.
 const MOST_FOUND: usize = 16;
 
-/// An address at which a peer may be, and what was said of it from there.
+/// An address at which a peer may be, with the contents of beacons from there.
 #[derive(Clone, Debug)]
 pub(super) struct DialAddress {
-    /// With the port to dial.
+    /// The address, with the port to dial.
     pub(super) address: SocketAddr,
     pub(super) sae: Option<String>,
     pub(super) advertised: Vec<SocketAddr>,
-    /// A link with this peer stood there.
+    /// True if a link with this peer was up there.
     pub(super) proven: bool,
-    /// It is at an address that we list, or where another link stood.
+    /// True if this host lists the address, or another link was up there.
     pub(super) known: bool,
-    /// The peer answered a probe there.
+    /// True if the peer answered a probe there.
     pub(super) answered: bool,
-    /// It was probed since its latest beacon.
+    /// True if it was probed since its latest beacon.
     pub(super) asked: bool,
-    /// When it was asked, after a goodbye from there, whether the peer is still there.
+    /// Time of the probe after a goodbye from there.
     pub(super) leaving: Option<Duration>,
 }
 
@@ -54,47 +54,47 @@ impl DialAddress {
     }
 }
 
-/// One daemon, by its id.
+/// The record of one daemon id.
 #[derive(Debug, Default)]
 pub(super) struct DaemonRecord {
-    /// Where beacons came from: by standing, and the latest first.
+    /// The sources of beacons: by standing, and the latest first.
     pub(super) sources: Vec<DialAddress>,
-    /// A beacon of it was acceptable; later ones that are not may be forged.
+    /// True if a beacon of it was acceptable; later unacceptable ones may be forged.
     pub(super) compatible: bool,
-    /// We list it.
+    /// True if this host lists it.
     pub(super) listed: bool,
-    /// It is on this host, or spoke to our QUIC port since this daemon looks no further than that.
+    /// True if it is on this host, or sent to this daemon's QUIC port since the range was last reduced.
     pub(super) near: bool,
-    /// Where the latest beacon under its id came from.
+    /// Source of the latest beacon under its id.
     pub(super) from: Option<IpAddr>,
     pub(super) last_seen: Duration,
     pub(super) last_answered: Option<Duration>,
-    /// Its mismatch was reported.
+    /// True if its mismatch was reported.
     pub(super) reported: bool,
-    /// A beacon that contradicts what stands was logged.
+    /// True if a beacon that contradicts the accepted one was logged.
     pub(super) contradicted: bool,
-    /// When it said goodbye while linked or dialled, or was asked whether it is still there.
+    /// Time of its goodbye while linked or dialled, or of the probe after a goodbye.
     pub(super) leaving: Option<Duration>,
-    /// When it was still there after a goodbye in its name.
+    /// Time at which it answered a probe after a goodbye in its name.
     pub(super) stayed: Option<Duration>,
     pub(super) linked: bool,
-    /// The path of its link does not work: it may have other addresses.
+    /// True if the path of its link is cut: the peer may have other addresses.
     pub(super) cut: bool,
-    /// The peer of the link did not prove that the id is its own: another one may have the id.
+    /// Set if the peer of the link did not prove that the id is its own: another host may have the id.
     pub(super) unproven: Option<UnprovenAddresses>,
-    /// One for each standing: a dial to an address where nobody is holds up no better one.
+    /// One entry per standing: a dial to an unused address delays no better one.
     pub(super) dials: [DialTime; AddressConfidence::COUNT],
 }
 
-/// Where the peer of a link is that did not prove its id, and the other addresses where it was found.
+/// The address of a linked peer that did not prove its id, and the other addresses where it was found.
 #[derive(Debug, Default)]
 pub(super) struct UnprovenAddresses(Vec<SocketAddr>);
 
-/// When to dial.
+/// The dial schedule of one standing.
 #[derive(Debug, Default)]
 pub(super) struct DialTime {
     pub(super) due: Option<Duration>,
-    /// Until when an outcome is awaited.
+    /// Time until which the dial's outcome is awaited.
     pub(super) in_flight: Option<Duration>,
     /// The address that was, or is, dialled first.
     pub(super) first: Option<SocketAddr>,
@@ -103,7 +103,7 @@ pub(super) struct DialTime {
 }
 
 impl DaemonRecord {
-    /// A beacon came from there; or the peer answered there.
+    /// Records a beacon from an address, or the peer's answer from there.
     pub(super) fn saw(&mut self, mut source: DialAddress) {
         let mut place = 0;
         if let Some(at) = self.sources.iter().position(|s| s.address == source.address) {
@@ -112,21 +112,21 @@ impl DaemonRecord {
             source.answered |= known.answered;
             source.known |= known.known;
             if known.proven {
-                // Who was linked has proven its name; a beacon proves nothing.
+                // A linked peer has proven its name; a beacon proves nothing.
                 source = DialAddress { proven: true, sae: known.sae, ..source };
             }
         }
-        // Who beacons most often is not dialled before the others while a path is cut.
+        // While a path is cut, the address with the most beacons is not dialled before the others.
         self.sources.insert(place, source);
         self.order();
     }
 
-    /// A link stands there. It is dialled there first, should the link end.
+    /// Records a link at this address. It is dialled first if the link ends.
     pub(super) fn proved(&mut self, address: SocketAddr) {
         for source in &mut self.sources {
             source.proven = source.address == address;
         }
-        // One that cannot be dialled has no beacon, and none of its sources a name.
+        // A peer that cannot be dialled has no beacon, and none of its sources has a name.
         if let (true, Some(first)) = (self.compatible, self.sources.first())
             && !self.sources.iter().any(|source| source.proven)
         {
@@ -139,7 +139,7 @@ impl DaemonRecord {
         self.order();
     }
 
-    /// Puts the sources in order again. Those of one standing push out no others.
+    /// Sorts the sources again. The sources of one standing displace no sources of another.
     pub(super) fn order(&mut self) {
         self.sources.sort_by_key(DialAddress::standing);
         let mut kept = [0; AddressConfidence::COUNT];
@@ -150,7 +150,7 @@ impl DaemonRecord {
         });
     }
 
-    /// Those that were left, as a goodbye said and nobody there denied in time.
+    /// Removes addresses whose goodbye was not contradicted by an answer in time, if they are known by beacons alone.
     pub(super) fn forget_unanswered(&mut self, now: Duration) {
         let left =
             |source: &DialAddress| source.leaving.is_some_and(|at| at + ANSWER_WITHIN <= now);
@@ -158,14 +158,14 @@ impl DaemonRecord {
             .retain(|source| !left(source) || source.standing() != AddressConfidence::Heard);
     }
 
-    /// The addresses of this standing, the latest first.
+    /// Returns the addresses of this standing, the latest first.
     pub(super) fn of(&self, standing: AddressConfidence) -> impl Iterator<Item = &DialAddress> {
         self.sources.iter().filter(move |source| source.standing() == standing)
     }
 
-    /// The addresses of this standing that may be dialled. While a link stands: those where another host may be that has
-    /// the id, if its address is known or it answered there; where the link's path is cut, those where the peer answered
-    /// since.
+    /// Returns the addresses of this standing that may be dialled. While a link is up, these are the addresses where
+    /// another host with the same id may be, if the address is known or a daemon answered there. If the link's path is
+    /// cut, they also include the addresses where the peer answered since.
     pub(super) fn to_dial(
         &self,
         standing: AddressConfidence,
@@ -180,17 +180,18 @@ impl DaemonRecord {
         })
     }
 
-    /// Whether, besides the linked host, another one that has the id may be at this address, or the linked one itself.
+    /// Returns whether another host with the id, or the linked peer itself, may be at this address in addition to the
+    /// link's.
     pub(super) fn may_be_at(&self, source: &DialAddress) -> bool {
         (self.cut && !source.proven) || self.unproven_addresses(source.address)
     }
 
-    /// Whether another host than the linked one may have the id, at this address.
+    /// Returns whether another host than the linked one may have the id, at this address.
     pub(super) fn unproven_addresses(&self, address: SocketAddr) -> bool {
         self.unproven.as_ref().is_some_and(|unproven| !unproven.0.contains(&address))
     }
 
-    /// A link stands with a peer at this address. `proven`: the id is its own.
+    /// Records that a link with a peer at this address is up. `proven`: the peer proved its id.
     pub(super) fn found(&mut self, address: SocketAddr, proven: bool) {
         let mut unproven = self.unproven.take().unwrap_or_default();
         if !proven {
@@ -201,27 +202,27 @@ impl DaemonRecord {
         }
     }
 
-    /// Where it is, as far as is known: the best of its addresses.
+    /// Returns the peer's probable host: that of its best address, or else the source of its latest beacon.
     pub(super) fn host(&self) -> Option<IpAddr> {
         self.sources.first().map(|source| source.address.ip()).or(self.from)
     }
 
-    /// Whether somebody answered there: what a forged source does not do.
+    /// Returns whether the peer answered, or was linked, at one of its addresses. A forged source does not answer.
     pub(super) fn has_answered(&self) -> bool {
         self.sources.iter().any(|source| source.proven || source.answered)
     }
 
-    /// The best standing of any of its addresses.
+    /// Returns the best standing of its addresses.
     pub(super) fn standing(&self) -> AddressConfidence {
         self.sources.first().map_or(AddressConfidence::Heard, DialAddress::standing)
     }
 
-    /// Whether a dial to addresses of this standing would make sense.
+    /// Returns whether a dial to addresses of this standing can succeed.
     pub(super) fn wants_dial(&self, standing: AddressConfidence) -> bool {
         let Some(source) = self.to_dial(standing).next() else { return false };
         let elsewhere =
             |dial: &DialTime| dial.in_flight.is_none() || dial.first != Some(source.address);
-        // While a link's path is cut one dial after the other: each would succeed the link.
+        // While a link's path is cut, dials run one after the other: each would succeed the link.
         let alone = !self.cut || self.in_flight().next().is_none();
         self.compatible
             && alone
@@ -242,7 +243,7 @@ impl DaemonRecord {
         }
     }
 
-    /// The dial failed; `jitter` is between 0.5 and 1.5.
+    /// Handles a failed dial; `jitter` is between 0.5 and 1.5.
     pub(super) fn failed(&mut self, standing: AddressConfidence, now: Duration, jitter: f64) {
         let dial = &mut self.dials[standing as usize];
         dial.in_flight = None;
@@ -266,8 +267,8 @@ impl DaemonRecord {
         last.map_or(at, |last| at.max(last + DIAL_SPACING))
     }
 
-    /// Puts an address behind the others of its standing. Somebody who answers there in the peer's name keeps none of
-    /// them out.
+    /// Moves an address behind the others of its standing. A host that answers there in the peer's name blocks none of
+    /// the others.
     fn put_last(&mut self, address: Option<SocketAddr>) {
         if let Some(at) = self.sources.iter().position(|source| Some(source.address) == address) {
             let source = self.sources.remove(at);
@@ -276,17 +277,17 @@ impl DaemonRecord {
         }
     }
 
-    /// The path of its link is cut: where it answered before says nothing any more.
+    /// Discards earlier answers, because the path of the link is cut and they prove nothing any more.
     pub(super) fn ask_anew(&mut self) {
         for source in self.sources.iter_mut().filter(|source| !source.proven) {
             (source.answered, source.asked) = (false, false);
         }
         self.order();
-        // The pause before other addresses are tried is for links that stand.
+        // The pause before other addresses are tried is for working links.
         self.dials.iter_mut().for_each(|dial| dial.due = None);
     }
 
-    /// The peer is linked, or was: nothing is under way.
+    /// Resets the dials, because the peer is, or was, linked: none is in flight.
     pub(super) fn done(&mut self) {
         for dial in &mut self.dials {
             dial.reset();
@@ -294,23 +295,23 @@ impl DaemonRecord {
         }
     }
 
-    /// Whether it said goodbye just now; forgets that it did.
+    /// Returns whether the peer said goodbye just now, and clears the goodbye.
     pub(super) fn left(&mut self, now: Duration) -> bool {
         self.leaving.take().is_some_and(|at| at + GOODBYE_COUNTS >= now)
     }
 
-    /// Whether it was there just now after a goodbye in its name: further ones say nothing.
+    /// Returns whether the peer answered just now after a goodbye in its name. If so, further goodbyes are ignored.
     pub(super) fn stays(&self, now: Duration) -> bool {
         self.stayed.is_some_and(|at| at + GOODBYE_COUNTS > now)
     }
 
-    /// When it is gone, if it is not heard before.
+    /// Returns when the peer counts as gone, unless it is heard before.
     pub(super) fn gone_at(&self, lifetime: Duration) -> Duration {
         let silent = self.last_seen + lifetime;
         self.leaving.map_or(silent, |at| silent.min(at + ANSWER_WITHIN))
     }
 
-    /// Nothing would be lost that the next beacon does not bring back.
+    /// Returns whether the next beacon would restore the whole record.
     pub(super) fn may_be_forgotten(&self) -> bool {
         !self.linked && self.in_flight().next().is_none()
     }
@@ -324,7 +325,7 @@ impl DialTime {
         self.in_flight = Some(now + DIAL_FORGOTTEN);
     }
 
-    /// Forgets failures, for a reason to hope; what is in flight stays.
+    /// Clears the failures, because a dial may succeed now. A dial in flight stays.
     pub(super) fn reset(&mut self) {
         self.failures = 0;
         self.due = None;

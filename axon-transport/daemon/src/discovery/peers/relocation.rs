@@ -1,5 +1,5 @@
-//! Looks for a linked peer at other addresses while the path of its link does not work: it may have moved, and this host
-//! too, so that neither knows where the other one is.
+//! Looks for a linked peer at other addresses while the path of its link does not work. Both hosts may have moved, so
+//! that neither knows the other's address.
 
 use std::time::Duration;
 
@@ -9,13 +9,13 @@ use super::PeerDiscovery;
 use crate::discovery::AddressConfidence;
 
 impl PeerDiscovery {
-    /// The path of the link with `daemon` works, or does not: then the daemon is looked for at other addresses.
+    /// Handles a change of the path to `daemon`. If the path does not work, looks for the daemon at other addresses.
     pub(crate) fn handle_path(&mut self, now: Duration, daemon: DaemonId, works: bool) {
         let Some(record) = self.records.get_mut(&daemon).filter(|record| record.linked) else {
             return;
         };
         let was_cut = std::mem::replace(&mut record.cut, !works);
-        // It is said again in case it was lost.
+        // The report is repeated in case it was lost.
         if works || was_cut {
             return;
         }
@@ -42,7 +42,7 @@ mod tests {
     const OLD: &str = "10.0.0.2:61301";
     const NEW: &str = "10.0.0.7:61301";
 
-    /// Linked with a peer at the old address.
+    /// Returns discovery that is linked with a peer at the old address.
     fn linked() -> PeerDiscovery {
         let mut peers = settled(local());
         hear(&mut peers, 3.0, beacon(HIGHER));
@@ -51,14 +51,14 @@ mod tests {
         peers
     }
 
-    /// A beacon comes from the new address. The probe of it, if one is sent.
+    /// Delivers a beacon from the new address. Returns the probe of that address, if one is sent.
     fn hear_new(peers: &mut PeerDiscovery, now: f64) -> Option<[u8; 8]> {
         let bytes = Datagram::Beacon(beacon(HIGHER)).encode();
         peers.handle_datagram(secs(now), from(NEW), Arrival::Shared, &bytes);
         probe(peers)
     }
 
-    /// The probe of the new address among what is to be done, which is nothing else.
+    /// Returns the probe of the new address, and checks that there are no other actions.
     fn probe(peers: &mut PeerDiscovery) -> Option<[u8; 8]> {
         let sent = actions(peers).into_iter().map(|action| match action {
             DiscoveryAction::SendFromQuicPort { to, bytes } if to == from(NEW) => {
@@ -96,7 +96,7 @@ mod tests {
             };
             assert_eq!(addrs[..], [from(NEW)]);
             peers.handle_link_up(secs(9.0), HIGHER, from(NEW), true);
-            // The old address, too, stands for nothing more while the new path works.
+            // Beacons from the old address have no effect either while the new path works.
             hear(&mut peers, 10.0, beacon(HIGHER));
             peers.handle_timeout(secs(60.0));
             assert_eq!(dials(&mut peers), []);
@@ -108,7 +108,7 @@ mod tests {
         let mut peers = linked();
         peers.handle_path(secs(5.0), HIGHER, false);
         let nonce = hear_new(&mut peers, 6.0).unwrap();
-        // Neither without the nonce, nor from elsewhere.
+        // An echo without the nonce, or from elsewhere, is ignored.
         answer(&mut peers, 6.1, [0; 8]);
         let echo = Datagram::Echo { daemon: HIGHER, nonce }.encode();
         peers.handle_datagram(secs(6.2), from("10.0.0.8:61301"), Arrival::Quic, &echo);

@@ -74,7 +74,7 @@ fn no_identity_exhausts_the_shared_pool() {
 }
 
 #[test]
-fn a_charge_makes_room_for_the_one_in_its_place_and_stays_where_that_does_not_fit() {
+fn replaced_charge_is_kept_if_the_new_one_exceeds_the_limit() {
     let pool = Meter::new(100);
     // Of an account that is gone, and of the one that the identity has now.
     let [old, new] = [80, 80].map(|most| Meter::within(&pool, most));

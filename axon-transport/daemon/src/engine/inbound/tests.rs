@@ -334,7 +334,7 @@ fn deliver_in_time(
 }
 
 #[test]
-fn a_sample_whose_memory_others_keep_is_lost_in_the_end_and_told_as_dropped() {
+fn sample_without_memory_is_dropped_in_the_end_and_reported() {
     let secs = Duration::from_secs;
     for kind in [Kind::Topic, Kind::Request] {
         let mut way = Way::new(kind, false, 10);

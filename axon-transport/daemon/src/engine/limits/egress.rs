@@ -129,7 +129,7 @@ mod tests {
     use crate::engine::limits::{IdentityLimits, tests::permissions};
 
     #[test]
-    fn packets_leave_at_the_rate_of_the_slowest_limit_over_all_connections_of_an_identity() {
+    fn slowest_limit_holds_for_all_connections_of_an_identity_together() {
         let rules = "[[limit]]\npeer = \"*\"\negress = \"1 MB/s\"\n[[limit]]\npeer = \"*\"\negress = \"9 MB/s\"";
         let all = IdentityLimits::default();
         let connections = [0, 1].map(|_| {

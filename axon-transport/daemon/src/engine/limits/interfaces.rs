@@ -157,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn a_limit_stays_as_full_as_it_is_when_rules_or_interfaces_are_read_again() {
+    fn bucket_of_a_limit_keeps_its_level_over_a_reload() {
         let text = "[[limit]]\ninterface = \"wlan0\"\negress = \"10 kB/s\"";
         let mut limits = limits(text);
         let is_closed = |limits: &InterfaceLimits| {

@@ -400,7 +400,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn a_route_that_is_made_anew_has_no_full_bucket_and_the_memory_for_that_is_bounded() {
+    fn new_route_inherits_the_bucket_of_the_old_one_within_bounded_memory() {
         let rules = "[[limit]]\npeer = \"*\"\ntopic = \"/**\"\nrate = 1\nburst = 1";
         let all = IdentityLimits::default();
         of(&all, Verb::Subscribe, "/a", rules).pass(&OF, 1, Duration::ZERO);

@@ -67,7 +67,7 @@ fn kind_of(verb: Verb) -> EndpointKind {
 /// The access rules for one peer.
 pub(super) struct PeerAccess {
     permissions: Permissions,
-    /// Whether the rules changed since the denied uses were judged.
+    /// True if the rules changed since the denied uses were judged.
     changed: bool,
     rights: RightsByEndpoint,
     /// Denied uses by the peer's endpoints on this host, each with its reason and its charge. The peer was
@@ -245,7 +245,7 @@ impl PeerAccess {
         (decisions.len() == uses).then_some(decisions)
     }
 
-    /// Each denied use, the host that denies it, and the reason.
+    /// Returns each denied use, the host that denies it, and the reason.
     fn all(&self) -> impl Iterator<Item = (&AccessUse, &'static str, &str)> {
         let there = self.there.iter().map(|(used, (why, _))| (used, "by the peer", &**why));
         there.chain(self.here.iter().map(|(used, (why, _))| (used, "here", &**why)))
@@ -317,7 +317,7 @@ mod tests {
         assert_eq!(set(&mut one, daemons[0], 0..700), (700, 0));
         assert_eq!(set(&mut other, daemons[1], 0..700), (324, 0));
         assert_eq!(set(&mut one, daemons[0], 0..700), (0, 0), "it was told");
-        // What one leaves the other may use, in the same step too.
+        // One peer may use the places that the other one leaves, in the same step too.
         assert_eq!(set(&mut one, daemons[0], 650..800), (100, 650));
         assert_eq!(set(&mut other, daemons[1], 0..700), (376, 0));
         drop(one);

@@ -1,4 +1,4 @@
-//! What this host asks a peer for: the routes that follow from the graphs of both.
+//! The routes that this host asks a peer for. They follow from the graphs of both hosts.
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashMap, HashSet},
@@ -64,12 +64,13 @@ impl Peer {
         self.feed_services(now);
     }
 
-    /// Whether the routes of services that the peer asked for changed, and with them those that are asked for here.
+    /// Returns whether the peer's servers that get requests of this host changed since the last
+    /// [`update`](Self::update). With them the routes to ask for change.
     pub(super) fn services_changed(&self) -> bool {
         self.answering != self.now_answering()
     }
 
-    /// The servers of the peer to which requests of this host go: their responses are wanted.
+    /// Returns the peer's servers that this host sends requests to. This host asks for their responses.
     fn now_answering(&self) -> BTreeSet<Gid> {
         let services = self.served.services().map(|(_, served)| served);
         let requests = services.filter(|served| served.key.kind == Kind::Request);
@@ -105,7 +106,7 @@ impl Peer {
         }
         self.inbound.handle_routes();
         if given_up > 0 {
-            // Others that the peer refused may have their place.
+            // Other routes, which the peer refused, may take the place of these.
             let instead = self.refused.unserved_without_time(given_up);
             self.ask_again(&instead);
         }
@@ -126,7 +127,7 @@ impl Peer {
             Some(asked) => asked,
             None => {
                 let hash = TopicHash::new(with.config.domain, &key.topic, &key.type_name);
-                // The peer's graph has no name that is too long.
+                // No name in the peer's graph is too long.
                 let Ok(topic) = hash else { return };
                 let room = self.remote.account().writers_of(&key);
                 AskedRoute {
@@ -291,7 +292,7 @@ impl Peer {
         }
     }
 
-    /// Does not ask for a route, or not for all of it.
+    /// Records that this host does not ask for a route, or not for all of it.
     fn does_not_ask(&mut self, key: &RouteKey, why: &'static str, now: Duration) {
         self.refused.set_unasked(key, why, now, &mut self.messages);
     }

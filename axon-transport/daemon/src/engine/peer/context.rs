@@ -8,7 +8,7 @@ use axon_transport::{config::Config, graph::Endpoint, internal::graph::EndpointR
 use super::{kept_relays::KeptRelays, routes::lanes::LocalWriterCounts, stalls::StallHistory};
 use crate::engine::{rings::Rings, stand_in::StandIns};
 
-/// The endpoints of applications on this host, and how far their sessions are discovered.
+/// The endpoints of applications on this host, with the discovery ranges of their sessions.
 pub(crate) type LocalEndpoints = BTreeMap<Gid, (Arc<Endpoint>, EndpointRange)>;
 
 /// The parts of the engine that all peers use.
@@ -19,7 +19,7 @@ pub(crate) struct PeerContext<'a> {
     pub(crate) stand_ins: &'a StandIns,
     /// The endpoints of this host.
     pub(crate) local: &'a LocalEndpoints,
-    /// How many writers of each route are among them.
+    /// The number of this host's writers for each route.
     pub(crate) writers: &'a LocalWriterCounts,
     /// The settings of this host.
     pub(crate) config: &'a Config,

@@ -4,14 +4,14 @@ use std::collections::VecDeque;
 
 use crate::link::{LinkClosed, LinkMessage};
 
-/// Links of which a peer is told again that they are closed: as many as may wait for their end.
+/// Most closed links that are reported to the peer again: as many as may wait for their end.
 const SAID_CLOSED: usize = 8;
 
 /// Control messages for one peer, in order.
 #[derive(Default)]
 pub(super) struct ControlQueue {
     messages: VecDeque<LinkMessage>,
-    /// Links that were closed while their packets did not arrive, the latest of them.
+    /// The latest links that were closed while their packets did not arrive.
     closed: Vec<LinkClosed>,
 }
 
@@ -21,18 +21,18 @@ impl ControlQueue {
         self.messages.push_back(message);
     }
 
-    /// The next message.
+    /// Returns the next message.
     pub(super) fn poll(&mut self) -> Option<LinkMessage> {
         self.messages.pop_front()
     }
 
-    /// Another link takes over: what was not sent is not sent.
+    /// Discards unsent messages, because another link takes over.
     pub(super) fn succeed(&mut self) {
         self.messages.clear();
     }
 
-    /// Adds that a link is closed, whose packets may not arrive, and once more of those before it: the link that takes
-    /// over may have come before these messages left.
+    /// Queues [`LinkClosed`] for a link whose packets may not arrive, and repeats it for earlier links: the link that
+    /// takes over may have come before their messages left.
     pub(super) fn say_closed(&mut self, closed: Option<LinkClosed>) {
         self.closed.extend(closed);
         let before = self.closed.len().saturating_sub(SAID_CLOSED);
@@ -49,7 +49,7 @@ mod tests {
         LinkClosed { link: [number; 16] }
     }
 
-    /// The links that are said to be closed.
+    /// Returns the links that are reported as closed.
     fn said(queue: &mut ControlQueue) -> Vec<LinkClosed> {
         let messages = std::iter::from_fn(|| queue.poll()).map(|message| match message {
             LinkMessage::LinkClosed(closed) => closed,

@@ -15,13 +15,13 @@ use crate::engine::{
     rings::RingReader,
 };
 
-/// How long a relay is kept.
+/// The time for which a relay is kept.
 const RELAY_RETENTION: Duration = Duration::from_secs(10);
 /// The most kept relays. An identity gets half of the rest. The samples of further relays are given up at
 /// once.
 const MAX_KEPT_RELAYS: usize = 2048;
 
-/// The relays that are kept.
+/// The kept relays.
 pub(crate) struct KeptRelays {
     all: Vec<KeptRelay>,
     room: Rc<Meter>,
@@ -132,8 +132,8 @@ impl KeptRelays {
         }
     }
 
-    /// Returns the relay that was kept, for a peer with this identity, for one of the subscriptions of a new
-    /// relay. It starts with the unacknowledged samples.
+    /// Returns a kept relay for a peer with this identity and for one of the subscriptions of a new relay. It starts
+    /// with the unacknowledged samples.
     ///
     /// Also returns the unfinished flows, so that a new daemon does not reset the `limit` on peers that take
     /// nothing or too little. The longest time for which a relay is kept counts as half of the limit. So a
@@ -163,7 +163,7 @@ impl KeptRelays {
         self.all.len()
     }
 
-    /// When [`give_up`](Self::give_up) is due.
+    /// Returns when [`give_up`](Self::give_up) is due.
     pub(crate) fn poll_timeout(&self) -> Option<Duration> {
         self.all.iter().map(|kept| kept.until).min()
     }

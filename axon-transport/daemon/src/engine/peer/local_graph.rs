@@ -1,4 +1,4 @@
-//! The graph of this host as one peer is shown it: live endpoints that the peer may see, and ended publishers whose
+//! The graph of this host that one peer is shown: live endpoints that the peer may see, and ended publishers whose
 //! samples have not all arrived there.
 
 use std::{collections::BTreeMap, sync::Arc, time::Duration};
@@ -17,7 +17,7 @@ use crate::{
     owner::ChannelBinding,
 };
 
-/// The graph of this host as one peer is shown it.
+/// The graph of this host that one peer is shown.
 pub(super) struct LocalGraph {
     peer: DaemonId,
     /// The graph that was sent to the peer.
@@ -28,11 +28,11 @@ pub(super) struct LocalGraph {
     ending: BTreeMap<Gid, RemoteEndpoint>,
 }
 
-/// What decides which endpoints of this host a peer may see.
+/// The inputs that decide which endpoints of this host a peer may see.
 pub(super) struct Visibility<'a> {
     /// The endpoints of this host.
     pub(super) local: &'a LocalEndpoints,
-    /// Whether a session of the peer lists this host.
+    /// True if a session of the peer lists this host.
     pub(super) listed: bool,
     /// The peer's rights on this host.
     pub(super) access: &'a mut PeerAccess,
@@ -44,7 +44,7 @@ impl LocalGraph {
         Self { peer, shown: AdvertisedGraph::default(), prover, ending: BTreeMap::new() }
     }
 
-    /// Proves over a new link what was proven over the link before.
+    /// Moves to a new link: repeats the proofs that were sent over the link before.
     pub(super) fn succeed(
         &mut self,
         binding: Option<ChannelBinding>,

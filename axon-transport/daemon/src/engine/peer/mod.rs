@@ -83,13 +83,13 @@ pub(crate) struct Peer {
     pub(super) remote: PeerGraph,
     /// The peer's rights on this host.
     access: PeerAccess,
-    /// Whether endpoints of the peer were ignored because another peer has the same ones.
+    /// True if endpoints of the peer were ignored because another peer has the same ones.
     pub(super) displaced: bool,
     /// The graph of this host that the peer is shown.
     local_graph: LocalGraph,
-    /// Whether the peer has been silent for so long that the control plane counts it as gone.
+    /// True if the peer has been silent for so long that the control plane counts it as gone.
     pub(super) silent: bool,
-    /// Whether the peer's graph changed and the change still has to be processed.
+    /// True if the peer's graph changed and the change still has to be processed.
     pub(super) stirred: bool,
     refusal_said: bool,
     asked: AskedRoutes,
@@ -350,7 +350,7 @@ impl Peer {
         self.local_graph.is_draining()
     }
 
-    /// Returns the graph of this host that the peer is shown, with what it depends on and where its messages go.
+    /// Returns the graph of this host that the peer is shown, with its inputs and the queue for its messages.
     fn local_graph<'a>(
         &'a mut self,
         local: &'a LocalEndpoints,
@@ -486,7 +486,7 @@ impl Peer {
         (status.held_bytes, status.held_limit) = (held.held(), held.most());
     }
 
-    /// Bytes of refused routes that are remembered.
+    /// Returns the bytes of remembered refused routes.
     #[cfg(test)]
     pub(super) fn held_of_refusals(&self) -> usize {
         self.refused.held()

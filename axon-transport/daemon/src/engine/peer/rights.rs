@@ -1,4 +1,4 @@
-//! What access rules let a peer see and use of the endpoints of this host, decided once for each of them.
+//! The rights of a peer on the endpoints of this host by the access rules, evaluated once for each endpoint.
 
 use std::{collections::HashMap, sync::Arc};
 
@@ -11,21 +11,21 @@ use axon_transport::{
 
 use crate::engine::peer_graph::decisions::note_look;
 
-/// What rules say of an endpoint of this host.
+/// The rights of a peer on an endpoint of this host.
 #[derive(Clone, Copy)]
 pub(super) struct EndpointRights {
-    /// The peer is shown it.
+    /// True if the peer is shown the endpoint.
     pub(super) shown: bool,
-    /// The peer may be at its other end.
+    /// True if the peer may be at the other end of the endpoint.
     pub(super) usable: bool,
 }
 
-/// The endpoints of this host that rules about the peer were asked about.
+/// The rights of a peer on the endpoints of this host that were evaluated.
 #[derive(Default)]
 pub(super) struct RightsByEndpoint(HashMap<Gid, (Arc<Endpoint>, EndpointRights)>);
 
 impl RightsByEndpoint {
-    /// What the rules say. They are asked about an endpoint that is new, or is not what it was.
+    /// Returns the peer's rights on an endpoint. The rules are evaluated only if the endpoint is new or changed.
     pub(super) fn judge(
         &mut self,
         rules: &Permissions,
@@ -46,7 +46,7 @@ impl RightsByEndpoint {
         judgement
     }
 
-    /// The rules changed: each endpoint is judged anew.
+    /// Discards all rights, because the rules changed: each endpoint is evaluated again.
     pub(super) fn clear(&mut self) {
         self.0.clear();
     }
@@ -77,7 +77,7 @@ mod tests {
     }
 
     #[test]
-    fn an_endpoint_is_judged_once_until_it_or_the_rules_change_or_it_is_gone() {
+    fn endpoint_is_judged_once_for_each_change_of_it_or_of_the_rules() {
         let closed = rules("[[deny]]\npeer = \"*\"\nsubscribe = \"/closed\"");
         let mut judged = RightsByEndpoint::default();
         let mut judge = |rules: &Permissions, topic| {
@@ -87,7 +87,7 @@ mod tests {
         };
         assert_eq!(judge(&closed, "/open"), (true, true, 1));
         assert_eq!(judge(&closed, "/open"), (true, true, 0));
-        // Its session made another endpoint of the same GID.
+        // The endpoint's session created another endpoint with the same GID.
         assert_eq!(judge(&closed, "/closed"), (true, false, 1));
         assert_eq!(judge(&closed, "/closed"), (true, false, 0));
         judged.clear();

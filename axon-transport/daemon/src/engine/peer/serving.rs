@@ -32,14 +32,14 @@ const NAME_COPIES: usize = 3;
 /// The relays of a route.
 struct Relays {
     sources: Vec<Source>,
-    /// Those among them that another daemon of the peer's host had.
+    /// The relays among them that were taken over from another daemon of the peer's host.
     adopted: Vec<Gid>,
-    /// The flows that these had.
+    /// The unfinished flows of the adopted relays.
     unfinished: UnfinishedFlows,
     without: Option<MissingRelay>,
 }
 
-/// That some of the relays of a route are not there, and why.
+/// Returns the text that some relays of a route are missing, with the reason.
 fn missing(missing: usize, asked: usize, why: &str) -> String {
     format!("{missing} of {asked} kinds of subscriptions get nothing: {why}")
 }
@@ -48,7 +48,7 @@ impl Peer {
     /// Serves a route.
     ///
     /// # Errors
-    /// The peer broke a rule.
+    /// The peer violated the protocol.
     pub(super) fn serve(
         &mut self,
         subscribe: Subscribe,
@@ -68,7 +68,7 @@ impl Peer {
             if self.served.get(other).is_some_and(|served| served.repeated) {
                 return Err(format!("{} has a route already", key.topic));
             }
-            // The number is of a link before this one.
+            // The number belongs to an earlier link.
             self.unserve(other);
         }
         if self.served.get(number).is_some_and(|old| !old.repeated && old.key != key) {
@@ -133,8 +133,8 @@ impl Peer {
             unfinished,
         };
         self.outbound.set_route(number, out, now);
-        // Of a relay that was kept: publishers that ended meanwhile. The graph of this host is followed late, so others
-        // may be newer than it.
+        // Reports the ended publishers of adopted relays. This host's graph is followed with a delay, so publishers of
+        // other relays may be newer than the graph.
         let adopted = sources.iter().filter(|source| adopted.contains(&source.gid()));
         for of in adopted.flat_map(Source::unacknowledged).map(|(of, _)| of) {
             if !with.local.contains_key(&of) {
@@ -155,7 +155,7 @@ impl Peer {
         Ok(())
     }
 
-    /// Whether it is served this topic's route for one of these subscriptions.
+    /// Returns whether this host serves the peer this topic's route for one of these subscriptions.
     pub(in crate::engine) fn serves_one_of(&self, asks: &Subscribe, subscriptions: &[Gid]) -> bool {
         let (topic, type_name) = (asks.topic.clone(), asks.type_name.clone());
         let key = RouteKey { kind: Kind::Topic, topic, type_name };
@@ -165,7 +165,7 @@ impl Peer {
             .is_some_and(|served| subscriptions.iter().any(|gid| served.subscribers.contains(gid)))
     }
 
-    /// The subscribers that are of the peer's own sessions.
+    /// Returns the subscribers that belong to the peer's own sessions.
     fn proven_only(
         &mut self,
         mut subscribers: Vec<RouteSubscriber>,
@@ -207,7 +207,7 @@ impl Peer {
         Some(StalledRoute { topic: served.key.topic.clone(), reason, samples })
     }
 
-    /// The peer no longer wants a route.
+    /// Ends a route that the peer no longer wants.
     pub(super) fn unserve(&mut self, route: u32) {
         self.refused.forget(route);
         if let Some(served) = self.served.get(route).filter(|served| served.key.kind != Kind::Topic)
@@ -226,8 +226,8 @@ impl Peer {
         lost.into_iter().for_each(|route| self.unserve(route));
     }
 
-    /// Opens the relays of a topic; those that the route has are kept. `places` and `lanes` are what counts for these, and
-    /// then for all.
+    /// Opens the relays of a topic and keeps the relays that the route has. `places` and `lanes` are the charges of the
+    /// kept relays at first, and of all relays at the end.
     fn open_relays(
         &self,
         key: &RouteKey,
@@ -263,7 +263,7 @@ impl Peer {
                 sources.push(Source::Relay(spec, reader));
                 continue;
             }
-            // What was kept stays kept where there is no place for it.
+            // A kept relay stays kept if there is no place for it.
             let Some(place) = self.remote.account().relays.charge(1) else {
                 let why = "this host has as many relays as a peer may have, or all peers";
                 without = Some((why.to_owned(), Some(ASK_AGAIN)));
@@ -313,7 +313,7 @@ impl Peer {
         Relays { sources, adopted, unfinished, without }
     }
 
-    /// The stand-ins from which the calls, or responses, of a service are taken.
+    /// Returns the stand-ins that supply the requests, or responses, of a service.
     fn sources_of_service(&self, key: &RouteKey) -> Vec<Source> {
         let asked = self.asked.get(&key.other_way());
         let stand_ins = asked.into_iter().flat_map(|asked| asked.stand_ins.values());
@@ -322,7 +322,7 @@ impl Peer {
         sources.into_iter().map(Source::StandIn).collect()
     }
 
-    /// Has the routes of services use the stand-ins that exist now.
+    /// Updates the routes of services to the stand-ins that exist now.
     pub(super) fn feed_services(&mut self, now: Duration) {
         let mut changes = Vec::new();
         for (number, served) in self.served.services() {
@@ -363,12 +363,12 @@ impl Peer {
         self.refused.refuse(number, key, reason, retry, now, &mut self.messages);
     }
 
-    /// Says which routes have a writer by now.
+    /// Reports the routes that have a writer by now.
     pub(super) fn announce_ready(&mut self, now: Duration) {
         for ready in self.served.take_ready(now) {
             let number = ready.route;
             self.say(LinkMessage::RouteReady(ready));
-            // What is ready is not refused: it is said in this order.
+            // The peer takes the report as the end of a refusal, so the refusal follows it.
             if let Some(served) = self.served.get(number)
                 && let Some((reason, again)) = served.without.clone()
             {

@@ -1,4 +1,4 @@
-//! Remembers peers that asked for a topic and stopped reading it, and how long they must wait to be served
+//! The history of peers that asked for a topic and stopped reading it, with the times that they must wait to be served
 //! again. The module does no I/O.
 
 use std::{collections::HashMap, rc::Rc, time::Duration};
@@ -43,7 +43,7 @@ struct PeerStalls {
 struct RouteStall {
     wait: Duration,
     until: Duration,
-    /// When the stall is forgotten.
+    /// The time at which the stall is forgotten.
     forgiven: Duration,
 }
 
@@ -145,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn a_peer_that_stalls_again_waits_twice_as_long_up_to_a_limit_and_is_forgiven() {
+    fn repeated_stall_doubles_the_pause_up_to_a_limit_and_expires() {
         let (mut stalls, ten) = (StallHistory::default(), Duration::from_secs(10));
         let (mut now, mut waits) = (NOW, Vec::new());
         for _ in 0..7 {
@@ -164,7 +164,7 @@ mod tests {
 
     /// A peer that empties the key store is cut after 96 times the limit, each time.
     #[test]
-    fn a_peer_that_holds_up_as_long_as_it_can_each_time_waits_longer_each_time() {
+    fn pause_grows_with_each_stall_of_full_length() {
         let (mut stalls, ten) = (StallHistory::default(), Duration::from_secs(10));
         let (mut now, mut waits) = (NOW, Vec::new());
         for _ in 0..7 {
@@ -177,7 +177,7 @@ mod tests {
     }
 
     #[test]
-    fn a_peer_that_stalls_on_very_many_topics_waits_on_all_and_no_other_is_served_sooner() {
+    fn stalls_on_many_topics_pause_all_routes_of_the_peer() {
         let (mut stalls, ten, now) = (StallHistory::default(), Duration::from_secs(10), NOW);
         stalls.add("pin leg", &key(0), ten, now);
         for number in 0..60_000 {
@@ -192,7 +192,7 @@ mod tests {
         stalls.add("pin leg", &key(1), ten, now);
         assert_eq!(stalls.left("pin leg", &key(1), now), Some(ten));
         assert_eq!(stalls.left("pin leg", &key(2), now), None);
-        // After that time the peer counts as any other.
+        // After that time the peer counts like any other.
         let later = now + LONGEST + ten * FORGIVEN.1;
         stalls.add("pin tail", &key(0), ten, later);
         assert_eq!((stalls.of.len(), stalls.left("pin arm", &key(5), later)), (1, None));

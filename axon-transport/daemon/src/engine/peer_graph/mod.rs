@@ -488,7 +488,7 @@ mod tests {
     }
 
     #[test]
-    fn an_endpoint_of_a_session_that_is_not_proven_is_left_out_and_one_that_is_counts() {
+    fn endpoint_of_an_unproven_session_is_omitted() {
         let (own, others) = (SessionKey::generate().unwrap(), SessionKey::generate().unwrap());
         let (binding, here) = ([7; 32], DaemonId([1; 16]));
         let mut remote = PeerGraph::new(

@@ -21,54 +21,55 @@ use crate::{
     owner::{ChannelBinding, EXPORTER},
 };
 
-/// Bulk that QUIC holds at most. Below that it is the congestion window and a little more: as much as may be on the
-/// way, and what leaves before the next pass. All else waits in the flows, where a newer sample can replace it.
+/// Most bulk that QUIC holds, in bytes. Below this limit QUIC holds the congestion window and a little more: the bytes
+/// in flight, and the bytes that leave before the next pass. All other bulk waits in the flows, where a newer sample
+/// can replace it.
 const MOST_BULK: u64 = 16 << 20;
-/// Bulk that QUIC holds beyond the congestion window: so much, or half as much as a smaller window, or an eighth of a
-/// larger one. On a slow path 64 KiB would take a quarter of a second.
+/// Bulk that QUIC holds beyond the congestion window, in bytes. It is at most half of a small window and at least an
+/// eighth of a large one. On a slow path 64 KiB would take a quarter of a second.
 const AHEAD: u64 = 64 << 10;
-/// How often the share of lost packets is measured, and how many packets make a measure.
+/// Interval between measurements of the share of lost packets, and least number of packets in a measurement.
 const LOSS_EVERY: (Duration, u64) = (Duration::from_millis(100), 20);
-/// Loss below this asks for no more bulk.
+/// A share of lost packets below this does not raise the amount of bulk.
 const NOTABLE_LOSS: f64 = 0.001;
-/// A link that loses this share of its packets, or more, is one that loses packets.
+/// A link that loses at least this share of its packets counts as lossy.
 const LOSES: f64 = 0.01;
-/// Times that bulk is multiplied under loss, at most.
+/// Maximum factor by which loss raises the amount of bulk.
 const MOST_ROUNDS: f64 = 6.0;
-/// Bytes more that QUIC holds for all other classes.
+/// Additional bytes that QUIC holds for all other classes.
 const RESERVE: u64 = 1 << 20;
-/// Where a limit lets less leave in this time, it holds that.
+/// If a limit lets fewer bytes leave in this time, QUIC holds that number instead.
 const RESERVE_TIME: Duration = Duration::from_millis(80);
 
 /// A QUIC connection.
 pub(crate) struct Connection {
     /// The endpoint that it belongs to.
     pub(in crate::engine) endpoint: usize,
-    /// Its name at the endpoint.
+    /// The handle of the connection at the endpoint.
     pub(in crate::engine) handle: ConnectionHandle,
-    /// Where the peer was when the connection began: there it received what the handshake needs.
+    /// The peer's address at the start of the connection: the peer received the packets of the handshake there.
     pub(in crate::engine) began_at: SocketAddr,
-    /// The address of this host that packets leave from, as far as it is known.
+    /// The address of this host that packets leave from, if it is known.
     local: Option<IpAddr>,
     /// The connection.
     pub(in crate::engine) quic: quinn_proto::Connection,
-    /// Its control stream.
+    /// The control stream.
     pub(in crate::engine) control: ControlStream,
     /// The flow of each data stream that this side opened.
     pub(in crate::engine) flows: HashMap<StreamId, FlowId>,
-    /// The limits on what it sends.
+    /// The limits on its output.
     pub(in crate::engine) egress: Egress,
-    /// How much is lost on the way.
+    /// The share of lost packets.
     loss: PacketLoss,
-    /// How much it carries.
+    /// The rate that the connection carries.
     rate: LinkRate,
-    /// Whether it is in the list of connections with something to do.
+    /// True if it is in the list of connections with something to do.
     pub(in crate::engine) is_dirty: bool,
-    /// Whether it is in the list of connections that may transmit.
+    /// True if it is in the list of connections that may transmit.
     pub(in crate::engine) is_transmitting: bool,
     /// The deadline under which the engine knows it.
     pub(in crate::engine) deadline: Option<std::time::Instant>,
-    /// Datagrams that came with an ECN mark.
+    /// The number of datagrams that arrived with an ECN mark.
     pub(in crate::engine) ecn_marks: u64,
 }
 
@@ -96,8 +97,9 @@ impl Connection {
         }
     }
 
-    /// A datagram came to this address of this host. A server's packets leave from the address that the connection began
-    /// at; where those of a client leave, the kernel decides, and it is taken for the interface that the peer's come by.
+    /// Handles a datagram that came to this address of this host. A server's packets leave from the address at which
+    /// the connection began. The kernel chooses the address of a client's packets; it is taken for the address at which
+    /// the peer's packets arrive.
     pub(in crate::engine) fn set_local(
         &mut self,
         came_to: Option<IpAddr>,
@@ -111,7 +113,7 @@ impl Connection {
         }
     }
 
-    /// Keeps to the limits on the interface that packets leave by.
+    /// Applies the limits of the interface that packets leave by.
     pub(in crate::engine) fn limit_interface(&mut self, limits: &InterfaceLimits) {
         let Some(local) = self.local else { return };
         self.egress.set_interface(limits, local);
@@ -121,13 +123,13 @@ impl Connection {
         }
     }
 
-    /// The certificates, or the raw public key, that the peer showed.
+    /// Returns the peer's certificates, or its raw public key.
     pub(in crate::engine) fn peer_chain(&self) -> Vec<CertificateDer<'static>> {
         let shown = self.quic.crypto_session().peer_identity();
         shown.and_then(|shown| shown.downcast().ok()).map(|shown| *shown).unwrap_or_default()
     }
 
-    /// Bytes that both ends of the connection share and no other connection has.
+    /// Returns bytes that both ends of the connection share and no other connection has.
     pub(in crate::engine) fn binding(&self) -> Option<ChannelBinding> {
         let mut binding = [0; 32];
         let session = self.quic.crypto_session();
@@ -135,7 +137,7 @@ impl Connection {
         Some(binding)
     }
 
-    /// Adds what QUIC measures to the link's status.
+    /// Adds QUIC's measurements to the link's status.
     pub(in crate::engine) fn fill(&self, status: &mut LinkStatus) {
         let path = self.quic.stats().path;
         status.address = self.quic.remote_address().to_string();
@@ -154,7 +156,7 @@ impl Connection {
         status.limits.extend(self.egress.interface_status());
     }
 
-    /// These packets leave: they count with the headers of IP and UDP.
+    /// Counts packets that leave, with their headers of IP and UDP.
     pub(in crate::engine) fn count_sent(&self, transmit: &Transmit, now: Duration) {
         let each = transmit.segment_size.unwrap_or(transmit.size).max(1);
         let packets = transmit.size.div_ceil(each) as u64;
@@ -162,7 +164,7 @@ impl Connection {
         self.egress.sent(packets, transmit.size as u64 + packets * headers, now);
     }
 
-    /// The connection as a carrier of samples.
+    /// Returns the connection as a carrier of samples.
     pub(in crate::engine) fn carrier<'a>(
         &'a mut self,
         seal: Seal<'a>,
@@ -193,12 +195,12 @@ impl Connection {
     }
 }
 
-/// The share of packets that are lost lately.
+/// The recent share of lost packets.
 #[derive(Debug, Default)]
 struct PacketLoss {
-    /// When it is measured again.
+    /// The time of the next measurement.
     due: Duration,
-    /// Packets sent and lost at the last measure.
+    /// Packets sent and lost at the last measurement.
     sent: u64,
     lost: u64,
     share: f64,
@@ -220,9 +222,10 @@ impl PacketLoss {
         self.share += (lost.min(0.9) - self.share) / 2.0;
     }
 
-    /// Windows of bulk that QUIC needs to keep the path full. It counts all bytes of a stream from the first one that
-    /// is not acknowledged. Of a window of n packets all but one have arrived after as many rounds as it takes until
-    /// `share` to their power is 1/n; what was sent in these rounds behind the last one counts too.
+    /// Returns the number of windows of bulk that QUIC needs to keep the path full. QUIC counts all bytes of a stream
+    /// from the first unacknowledged one. All but one packet of a window of n packets have arrived after r rounds,
+    /// where `share` to the power of r is 1/n. The bytes that were sent in these rounds behind the last packet count
+    /// too.
     fn rounds(&self, window: u64, mtu: u16) -> f64 {
         if self.share < NOTABLE_LOSS {
             return 1.0;
@@ -236,62 +239,63 @@ impl PacketLoss {
 pub(crate) struct Carrier<'a> {
     /// The connection.
     pub(in crate::engine) quic: &'a mut quinn_proto::Connection,
-    /// Protects the messages.
+    /// The protection of the messages.
     pub(in crate::engine) seal: Seal<'a>,
     /// The flow of each stream.
     pub(in crate::engine) streams: &'a mut HashMap<StreamId, FlowId>,
-    /// The flow whose turn it is.
+    /// The current flow.
     pub(in crate::engine) flow: FlowId,
     /// The priorities of the routes.
     pub(in crate::engine) priorities: Priorities,
-    /// The rank as which the flow sends, where that is another one than its own.
+    /// The rank as which the flow sends, if it is not its own.
     pub(in crate::engine) lender: Option<Rank>,
-    /// The place of the highest rank of which flows wait for credit.
+    /// The place of the highest rank whose flows wait for credit.
     pub(in crate::engine) closed_from: Option<usize>,
     /// Bytes that QUIC took in this pass.
     pub(in crate::engine) taken: u64,
     window: u64,
     bulk: u64,
-    /// What QUIC may hold more of all other classes.
+    /// Additional bytes that QUIC may hold for all other classes.
     reserve: u64,
-    /// Whether the link loses packets.
+    /// True if the link loses packets.
     pub(in crate::engine) loses: bool,
-    /// Bytes a second that the link carries, if it was full lately or a limit says it.
+    /// The rate that the link carries in bytes per second, if the link was full lately or a limit states the rate.
     pub(in crate::engine) rate: Option<f64>,
     measured: &'a mut LinkRate,
 }
 
 impl Carrier<'_> {
-    /// The congestion window in bytes.
+    /// Returns the congestion window in bytes.
     pub(in crate::engine) fn window(&self) -> u64 {
         self.window
     }
 
-    /// What QUIC may hold while a flow of this rank writes. What others filled is no obstacle to a higher priority.
+    /// Returns the bytes that QUIC may hold while a flow of this rank writes. Bytes of lower priorities do not block a
+    /// higher priority.
     pub(in crate::engine) fn limit_of(&self, rank: Rank) -> u64 {
         let reserve = if rank.class == Class::Bulk { 0 } else { self.reserve };
         (1 + self.priorities.below(rank.priority)) * self.bulk + reserve
     }
 
-    /// The rank as which a flow of this rank writes.
+    /// Returns the rank as which a flow of this rank writes.
     pub(in crate::engine) fn rank(&self, own: Rank) -> Rank {
         self.lender.unwrap_or(own)
     }
 
-    /// Whether a flow of this rank may use credit: none of its rank or a higher one waits for some.
+    /// Returns whether a flow of this rank may use credit: no flow of its rank or a higher one waits for credit.
     pub(in crate::engine) fn is_open_to(&self, own: Rank) -> bool {
         self.closed_from.is_none_or(|place| self.rank(own).place() < place)
     }
 
-    /// Lets QUIC take what it may hold while a flow of this rank writes.
+    /// Sets the bytes that QUIC may hold while a flow of this rank writes.
     pub(in crate::engine) fn limit(&mut self, rank: Rank) {
         self.quic.set_send_window(self.limit_of(rank));
     }
 
-    /// Ends the pass. QUIC says that it takes more once it would of each flow that is blocked: `least` is the least of
-    /// their limits. It would say so at once, and again and again, if it took more of one while another cannot write,
-    /// whose stream the peer does not read. A flow with a higher limit has samples in QUIC until then.
-    /// The link `is_full` while a flow waits for QUIC.
+    /// Ends the pass. QUIC reports that it takes more bytes once it would take more of each blocked flow: `least` is
+    /// the least of their limits. With a higher value it would report at once, and again and again, if it took more of
+    /// one flow while another cannot write because the peer does not read its stream. A flow with a higher limit has
+    /// samples in QUIC until then. The link `is_full` while a flow waits for QUIC.
     pub(in crate::engine) fn rest(&mut self, least: Option<u64>, is_full: bool, now: Duration) {
         self.quic.set_send_window(least.unwrap_or(self.bulk));
         let left = || {

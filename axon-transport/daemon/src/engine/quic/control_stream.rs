@@ -1,4 +1,4 @@
-//! The control stream of a connection: messages of the link protocol, each in a frame behind its length
+//! The control stream of a connection. It carries messages of the link protocol, each in a frame after its length
 //! (`docs/formats.md`, section 4).
 
 use std::{collections::VecDeque, rc::Rc, time::Duration};
@@ -14,16 +14,16 @@ use crate::{
     },
 };
 
-/// Bytes of messages that wait for a peer that does not read them.
+/// Most bytes of messages that wait for a peer that does not read them.
 const MAX_QUEUED: usize = 64 << 20;
 /// The priority of the stream: before all data.
 const PRIORITY: i32 = i32::MAX;
 
-/// Why nothing more comes.
+/// The reason for which no more messages arrive.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub(crate) enum ControlError {
-    /// The peer broke the format.
+    /// The peer violated the format.
     #[error(transparent)]
     Frame(#[from] FrameError),
     /// The stream ended.
@@ -35,7 +35,7 @@ pub(crate) enum ControlError {
 }
 
 impl ControlError {
-    /// The code with which the link is closed; `None` when the stream ended.
+    /// Returns the code with which the link is closed; `None` if the stream ended.
     pub(crate) fn code(&self) -> Option<CloseCode> {
         match self {
             Self::Frame(FrameError::TooLarge { .. }) | Self::Unread => Some(CloseCode::TooLarge),
@@ -45,33 +45,33 @@ impl ControlError {
     }
 }
 
-/// What may be read, as far as the link has been opened.
+/// The limits of a frame at each stage of the link's opening.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct FrameLimits {
-    /// Bytes of a frame.
+    /// Most bytes of a frame.
     pub(crate) frame: usize,
-    /// Bytes of a frame once it is decompressed.
+    /// Most bytes of a decompressed frame.
     pub(crate) inflated: usize,
 }
 
 impl FrameLimits {
-    /// Before the peer's HELLO was checked.
+    /// Limits before the peer's HELLO was checked.
     pub(crate) const BEFORE_HELLO: Self =
         Self { frame: MAX_FRAME_BEFORE_HELLO, inflated: MAX_FRAME_BEFORE_HELLO };
-    /// After HELLO, before the peer has proven who it is.
+    /// Limits after HELLO, before the peer has proven its identity.
     pub(crate) const UNPROVEN: Self = Self { frame: MAX_FRAME, inflated: MAX_FRAME_BEFORE_HELLO };
-    /// The peer has proven who it is.
+    /// Limits after the peer has proven its identity.
     pub(crate) const PROVEN: Self = Self { frame: MAX_FRAME, inflated: MAX_INFLATED };
 }
 
-/// What is read of a control stream.
+/// The result of a read of a control stream.
 #[derive(Debug)]
 pub(crate) enum ControlInput {
-    /// A message, with what it weighs on the account until it is handled.
+    /// A message, with its charge on the account until it is handled.
     Message(Box<LinkMessage>, Option<Charge>),
-    /// No whole message has come, or the peer has to wait.
+    /// No complete message has arrived, or the peer has to wait.
     Nothing,
-    /// One has come, and is decompressed once messages of the same identity are handled.
+    /// A complete message has arrived. It is decompressed once messages of the same identity are handled.
     NoRoom,
 }
 
@@ -80,22 +80,22 @@ pub(crate) enum ControlInput {
 pub(crate) struct ControlStream {
     stream: Option<StreamId>,
     limits: FrameLimits,
-    /// Frames that wait, with what they weigh on the account.
+    /// Waiting frames, each with its charge on the account.
     out: VecDeque<(Bytes, Option<Charge>)>,
     queued: usize,
     meter: Option<Rc<Meter>>,
-    /// What messages take that are decompressed and not handled.
+    /// The memory of messages that are decompressed and not handled yet.
     decoded: Option<Rc<Meter>>,
-    /// Nothing is sent after the frames that wait.
+    /// True if nothing is sent after the waiting frames.
     finishing: bool,
     finished: bool,
-    /// The rest of the last piece that QUIC gave.
+    /// The rest of the last chunk that QUIC returned.
     piece: Bytes,
     /// The length and body of the frame that is being read.
     frame: Vec<u8>,
-    /// Whether the frame that was read is paid for.
+    /// The cost of the frame that was read, once it was charged to the peer's rate.
     paid: Option<u32>,
-    /// Until when no further frame is read: the peer has used up its rate.
+    /// The time until which no further frame is read, because the peer has used up its rate.
     paused_until: Option<Duration>,
     readable: bool,
     ended: bool,
@@ -123,24 +123,24 @@ impl Default for ControlStream {
 }
 
 impl ControlStream {
-    /// Uses this stream.
+    /// Uses this stream as the control stream.
     pub(in crate::engine) fn open(&mut self, stream: StreamId, quic: &mut quinn_proto::Connection) {
         self.stream = Some(stream);
         self.readable = true;
         let _ = quic.send_stream(stream).set_priority(PRIORITY);
     }
 
-    /// The stream, once there is one.
+    /// Returns the stream, once there is one.
     pub(in crate::engine) fn stream(&self) -> Option<StreamId> {
         self.stream
     }
 
-    /// What may be read from now on.
+    /// Sets the limits of the next frames.
     pub(in crate::engine) fn set_limits(&mut self, limits: FrameLimits) {
         self.limits = limits;
     }
 
-    /// Messages that wait, to be sent or to be handled, count on this account from now on.
+    /// Charges waiting messages, to be sent or to be handled, to this account from now on.
     pub(in crate::engine) fn charge_to(&mut self, account: &Account) {
         self.meter = Some(Rc::clone(&account.unsent));
         self.decoded = Some(Rc::clone(&account.decoded));
@@ -164,29 +164,29 @@ impl ControlStream {
         Ok(())
     }
 
-    /// Nothing is sent after the messages that wait.
+    /// Ends the output after the waiting messages.
     pub(in crate::engine) fn finish(&mut self) {
         self.finishing = true;
     }
 
-    /// The connection is closed: nothing is read any more.
+    /// Stops reading, because the connection is closed.
     pub(in crate::engine) fn close(&mut self) {
         self.paused_until = None;
         self.ended = true;
     }
 
-    /// Bytes that wait to be sent, and that came and are not handled.
+    /// Returns the bytes that wait to be sent, and the bytes that arrived and are not handled.
     #[cfg(test)]
     pub(in crate::engine) fn held(&self) -> (usize, usize) {
         (self.queued, self.piece.len() + self.frame.len())
     }
 
-    /// Whether frames wait.
+    /// Returns whether frames wait.
     pub(in crate::engine) fn has_output(&self) -> bool {
         !self.out.is_empty() || self.finishing && !self.finished
     }
 
-    /// Bytes of messages that wait for QUIC.
+    /// Returns the bytes of messages that wait for QUIC.
     pub(in crate::engine) fn queued(&self) -> usize {
         self.queued
     }
@@ -194,7 +194,7 @@ impl ControlStream {
     /// Hands frames to QUIC. Returns whether it took any.
     pub(in crate::engine) fn write(&mut self, quic: &mut quinn_proto::Connection) -> bool {
         let Some(stream) = self.stream else { return false };
-        // Control is small, and goes first whatever else QUIC holds.
+        // Control messages are small, and go first whatever other data QUIC holds.
         quic.set_send_window(u64::MAX);
         let mut wrote = false;
         while let Some((frame, _)) = self.out.front_mut() {
@@ -223,27 +223,28 @@ impl ControlStream {
         wrote
     }
 
-    /// QUIC has more of the stream.
+    /// Records that QUIC has more data of the stream.
     pub(in crate::engine) fn handle_readable(&mut self) {
         self.readable = true;
     }
 
-    /// When reading goes on, if the peer said as much as it may.
+    /// Returns when reading continues, if the peer has used up its rate.
     pub(in crate::engine) fn poll_timeout(&self) -> Option<Duration> {
         self.paused_until
     }
 
-    /// Whether there may be a message.
+    /// Returns whether there may be a message.
     pub(in crate::engine) fn has_input(&self, now: Duration) -> bool {
         !self.ended
             && (self.readable || !self.piece.is_empty() || self.paid.is_some())
             && self.paused_until.is_none_or(|until| until <= now)
     }
 
-    /// The next message, if there is one. `owe` is told what reading it costs, and says how long the peer has to wait then.
+    /// Returns the next message, if there is one. The function calls `owe` with the cost of the message; `owe` returns
+    /// the time that the peer then has to wait.
     ///
     /// # Errors
-    /// Nothing more comes.
+    /// No more messages arrive.
     pub(in crate::engine) fn read(
         &mut self,
         quic: &mut quinn_proto::Connection,
@@ -309,7 +310,8 @@ impl ControlStream {
         self.paused_until.is_some()
     }
 
-    /// Reads on until a frame is whole. Its memory grows with what arrives, not with what the peer says.
+    /// Reads until a frame is complete. The memory grows with the bytes that arrive, not with the length that the peer
+    /// states.
     fn gather(&mut self, quic: &mut quinn_proto::Connection) -> Result<bool, ControlError> {
         loop {
             let wanted = match self.frame.first_chunk::<4>() {
@@ -340,7 +342,7 @@ impl ControlStream {
             }
         };
         let next = chunks.next(usize::MAX);
-        // What it wants to send leaves with the pass.
+        // The frames that this call wants to send leave with the pass.
         let _ = chunks.finalize();
         match next {
             Ok(Some(chunk)) => {

@@ -17,7 +17,7 @@ use quinn_proto::{
 pub(in crate::engine) struct EndpointPacket {
     /// The endpoint that sends it.
     pub(in crate::engine) endpoint: usize,
-    /// Where it goes.
+    /// The receiver's address.
     pub(in crate::engine) to: SocketAddr,
     /// The local address, if it matters.
     pub(in crate::engine) from: Option<IpAddr>,
@@ -25,19 +25,19 @@ pub(in crate::engine) struct EndpointPacket {
     pub(in crate::engine) bytes: Vec<u8>,
 }
 
-/// A datagram that was handed to an endpoint.
+/// The result of a datagram that an endpoint handled.
 pub(in crate::engine) enum EndpointInput {
-    /// It is of this connection.
+    /// The datagram belongs to this connection.
     Connection(ConnectionHandle, ConnectionEvent),
-    /// It begins a connection.
+    /// The datagram begins a connection.
     Incoming(Incoming),
-    /// Nothing is left to do.
+    /// The datagram is handled.
     Done,
 }
 
-/// Whether a socket bound to `local` reaches the address `to`.
+/// Returns whether a socket bound to `local` reaches the address `to`.
 pub(crate) fn reaches(local: SocketAddr, to: SocketAddr) -> bool {
-    // 127.0.0.1 alone must not be asked to reach another host.
+    // A socket at 127.0.0.1 alone must not be asked to reach another host.
     let same_reach = local.ip().is_loopback() == to.ip().is_loopback();
     local.is_ipv4() == to.is_ipv4() && (same_reach || local.ip().is_unspecified())
 }
@@ -48,12 +48,12 @@ pub(in crate::engine) struct QuicEndpoints {
     packets: VecDeque<EndpointPacket>,
 }
 
-/// Packets of endpoints that wait at most; more are dropped, as a full socket drops them.
+/// Most packets of endpoints that wait; further packets are dropped, like at a full socket.
 const MAX_PACKETS: usize = 1024;
 
 impl QuicEndpoints {
-    /// Endpoints at these local addresses. `server` gives the answer to packets of unknown connections; each
-    /// connection has settings of its own.
+    /// Creates endpoints at these local addresses. `server` has the settings for answers to packets of unknown
+    /// connections; each connection has its own settings.
     pub(in crate::engine) fn new(
         addresses: &[SocketAddr],
         config: &Arc<EndpointConfig>,
@@ -66,7 +66,7 @@ impl QuicEndpoints {
         Self { all: addresses.iter().map(endpoint).collect(), packets: VecDeque::new() }
     }
 
-    /// The endpoint that reaches an address.
+    /// Returns the endpoint that reaches an address.
     pub(in crate::engine) fn towards(&self, to: SocketAddr) -> Option<usize> {
         self.all.iter().position(|(address, _)| reaches(*address, to))
     }
@@ -96,10 +96,10 @@ impl QuicEndpoints {
         }
     }
 
-    /// Begins a connection to an address.
+    /// Starts a connection to an address.
     ///
     /// # Errors
-    /// QUIC refuses; `None` if no endpoint reaches the address.
+    /// QUIC refuses the connection; `None` if no endpoint reaches the address.
     pub(in crate::engine) fn connect(
         &mut self,
         now: Instant,
@@ -114,7 +114,7 @@ impl QuicEndpoints {
     /// Accepts a connection.
     ///
     /// # Errors
-    /// Why it failed at once. The peer has been told.
+    /// Returns the reason if the connection failed at once. The peer has been informed.
     pub(in crate::engine) fn accept(
         &mut self,
         now: Instant,
@@ -141,7 +141,7 @@ impl QuicEndpoints {
         self.respond(endpoint, &transmit, buffer);
     }
 
-    /// Has the peer prove that it receives at its address, or refuses it where that cannot be.
+    /// Asks the peer to prove that it receives at its address. Refuses the connection if that is not possible.
     pub(in crate::engine) fn retry(&mut self, endpoint: usize, incoming: Incoming) {
         if !incoming.may_retry() {
             return self.refuse(endpoint, incoming);
@@ -162,7 +162,8 @@ impl QuicEndpoints {
         self.all[endpoint].1.handle_event(handle, event)
     }
 
-    /// Sends a datagram that is not QUIC's, from the port of QUIC. An address that no endpoint reaches drops it.
+    /// Sends a datagram that is not QUIC's from the port of QUIC. The datagram is dropped if no endpoint reaches the
+    /// address.
     pub(in crate::engine) fn send(&mut self, to: SocketAddr, bytes: Vec<u8>) {
         if let Some(endpoint) = self.towards(to) {
             self.push(EndpointPacket { endpoint, to, from: None, ecn: None, bytes });
@@ -181,7 +182,7 @@ impl QuicEndpoints {
         }
     }
 
-    /// The next packet that is not of a connection.
+    /// Returns the next packet that does not belong to a connection.
     pub(in crate::engine) fn poll_packet(&mut self) -> Option<EndpointPacket> {
         self.packets.pop_front()
     }

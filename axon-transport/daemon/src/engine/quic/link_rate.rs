@@ -1,29 +1,30 @@
-//! The rate at which a link carries data, where more waits than it carries.
+//! The rate at which a link carries data, measured while more data waits than the link carries.
 
 use std::time::Duration;
 
-/// A measure takes so long at least, and so many round trips: what the window lets leave at once is a small part then.
+/// Minimum duration of a measurement, also in round trips. The bytes that the window lets leave at once are then a
+/// small part of it.
 const SPAN: (Duration, u32) = (Duration::from_millis(50), 4);
-/// It counts where at least this share of the window left in each round trip: else the peer or the path let nothing pass.
+/// Minimum share of the window sent per round trip; below it, the peer or the path limited the output.
 const OF_WINDOW: f64 = 0.5;
-/// And where the measure before it was nearly as high: a link begins slowly.
+/// Maximum ratio of a rate to the rate of the measurement before: a link begins slowly.
 const STEADY: f64 = 1.25;
-/// A rate is believed for so long. What is compressed may leave the link idle, so nothing would measure it again.
+/// Maximum age of a rate. Compressed samples may leave the link idle, so that no new measurement replaces the rate.
 const BELIEVED: Duration = Duration::from_secs(30);
 
 /// Measures the rate of one link.
 #[derive(Debug, Default)]
 pub(crate) struct LinkRate {
-    /// When the measure began, and how many bytes had left by then.
+    /// The start of the measurement, and the bytes that had left by then.
     begun: Option<(Duration, u64)>,
-    /// The rate of the measure before that.
+    /// The rate of the previous measurement.
     before: f64,
-    /// Bytes a second, and when they were measured.
+    /// The rate in bytes per second, and the time of its measurement.
     measured: Option<(f64, Duration)>,
 }
 
 impl LinkRate {
-    /// A pass ended in which QUIC did not take all that there was, if the link `is_full`.
+    /// Handles the end of a pass. The link `is_full` if QUIC did not take all waiting samples.
     pub(crate) fn handle_pass(
         &mut self,
         now: Duration,
@@ -54,7 +55,7 @@ impl LinkRate {
         }
     }
 
-    /// Bytes a second that the link carries, if it was full lately.
+    /// Returns the rate that the link carries in bytes per second, if it was full lately.
     pub(crate) fn get(&self, now: Duration) -> Option<f64> {
         let (rate, at) = self.measured?;
         (now.saturating_sub(at) < BELIEVED).then_some(rate)
@@ -66,14 +67,14 @@ mod tests {
     use super::*;
 
     const RTT: Duration = Duration::from_millis(4);
-    /// Fits a megabyte a second.
+    /// The window of a link that carries a megabyte per second.
     const WINDOW: u64 = 4_000;
 
     fn ms(ms: u64) -> Duration {
         Duration::from_millis(ms)
     }
 
-    /// A link that is full from this time on and carries so many bytes in each of so many milliseconds.
+    /// Simulates a full link from this time on, which carries `each` bytes in each of `time` milliseconds.
     fn run(rate: &mut LinkRate, from: u64, time: u64, left: &mut u64, each: u64) {
         for at in from..=from + time {
             rate.handle_pass(ms(at), true, || *left, WINDOW, RTT);
@@ -88,11 +89,11 @@ mod tests {
         assert_eq!(rate.get(ms(99)), None, "one measure");
         run(&mut rate, 100, 0, &mut left, 1_000);
         assert_eq!(rate.get(ms(100)), Some(1e6));
-        // Slower, but as its window says.
+        // Slower, but as fast as the window permits.
         run(&mut rate, 101, 100, &mut left, 600);
         let slower = rate.get(ms(201)).unwrap();
         assert!((slower - 6e5).abs() < 1e4, "{slower}");
-        // Faster at once.
+        // A faster rate counts at once.
         run(&mut rate, 202, 50, &mut left, 2_000);
         assert!(rate.get(ms(252)).unwrap() > 1.9e6);
     }

@@ -1,4 +1,4 @@
-//! QUIC as the engine uses it: endpoints, connections with their control stream, and the settings of both.
+//! The parts of QUIC that the engine uses: endpoints, connections with their control stream, and the settings of both.
 
 pub(crate) mod connection;
 pub(crate) mod control_stream;

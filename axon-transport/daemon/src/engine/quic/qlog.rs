@@ -1,7 +1,7 @@
-//! QUIC's events of each connection, in the format qlog.
+//! The qlog events of each QUIC connection.
 //!
-//! QUIC writes the headers of packets, losses, and what its congestion controller measures. It writes no payload. What
-//! is written says the address of the peer and nothing that a peer chose, such as a name.
+//! QUIC writes the headers of packets, losses, and the measurements of its congestion controller. It writes no payload.
+//! The events contain the address of the peer and no text that a peer chose, such as a name.
 
 use std::{io, net::SocketAddr, time::Instant};
 
@@ -9,13 +9,13 @@ use quinn_proto::{QlogConfig, QlogStream};
 
 use crate::link::Side;
 
-/// Where the events go. The daemon has files, which no call here waits for.
+/// The destination of the events. The daemon writes to files, and no call here waits for them.
 pub(crate) trait Qlogs {
-    /// A writer for the events of a new connection. Its writes never fail: QUIC would log each failure.
+    /// Returns a writer for the events of a new connection. Its writes never fail: QUIC would log each failure.
     fn open(&self, side: Side) -> Option<Box<dyn io::Write + Send + Sync>>;
 }
 
-/// The stream of a new connection's events, where they are written.
+/// Returns the stream of a new connection's events, if they are written.
 pub(in crate::engine) fn stream(
     qlogs: Option<&dyn Qlogs>,
     side: Side,

@@ -1,9 +1,9 @@
-//! The settings of a [`Config`](axon_transport::config::Config) as `axon-tls` has them.
+//! Converts the settings of a [`Config`](axon_transport::config::Config) to those of `axon-tls`.
 
 use axon_tls::{Cipher, PskKex};
 use axon_transport::config::{QkdKex, QuicCipher};
 
-/// The cipher suite of `AXON_QUIC_CIPHER`.
+/// Returns the cipher suite of `AXON_QUIC_CIPHER`.
 pub(crate) const fn tls_cipher(cipher: QuicCipher) -> Cipher {
     match cipher {
         QuicCipher::ChaCha20Poly1305 => Cipher::ChaCha20Poly1305,
@@ -11,7 +11,7 @@ pub(crate) const fn tls_cipher(cipher: QuicCipher) -> Cipher {
     }
 }
 
-/// The use of a pre-shared key of `AXON_QKD_KEX`.
+/// Returns the use of a pre-shared key of `AXON_QKD_KEX`.
 pub(crate) const fn psk_kex(kex: QkdKex) -> PskKex {
     match kex {
         QkdKex::PskKe => PskKex::PskKe,

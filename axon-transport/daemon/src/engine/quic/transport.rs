@@ -14,28 +14,29 @@ use quinn_proto::{
 use crate::engine::congestion::DelayConfig;
 use crate::engine::congestion::marks::EcnCountingFactory;
 
-/// A link whose peer is silent ends after this. Until then its flows and routes stand, and a successor takes them over.
+/// A link whose peer is silent ends after this time. Until then its flows and routes stay, and a successor takes them
+/// over.
 const IDLE_TIMEOUT_MS: u32 = 120_000;
 
-/// Data streams a peer may open before its HELLO is checked; quinn allocates each of them.
+/// Most data streams that a peer may open before its HELLO is checked; quinn allocates each of them.
 const STREAMS_BEFORE_HELLO: u32 = 128;
 
-/// Data streams of an open link: one per publisher and route, and best-effort messages in flight.
+/// Most data streams of an open link: one per publisher and route, and best-effort messages in flight.
 pub(crate) const STREAMS_OPEN: u32 = 4096;
 
 const SEND_WINDOW: u64 = 16 << 20;
 
-/// The least and the greatest window of one stream.
+/// The least and the greatest window of one stream, in bytes.
 pub(crate) const STREAM_WINDOW: (u64, u64) = (1 << 20, 4 << 20);
 
-/// What a link may have under way before it is elected, and each link has then beside its share of what
-/// its peer may have.
+/// Bytes that a link may have in flight before it is elected. After that each link has them in addition to its share of
+/// the peer's window.
 pub(crate) const LINK_WINDOW: u32 = 1 << 20;
 
 /// The part of a connection's window that long samples leave to others: a quarter.
 const RESERVED: u64 = 4;
 
-/// Bytes of long samples that a peer may have in flight where so many may be unread.
+/// Returns the bytes of long samples that a peer may have in flight, if `unread` bytes may be unread.
 pub(crate) fn window_credit(unread: u64) -> u64 {
     unread - unread / RESERVED
 }
@@ -60,39 +61,40 @@ impl HmacKey for ResetKey {
 
 pub(crate) fn endpoint_config(reset_key: &[u8; 32]) -> EndpointConfig {
     let key = hmac::Key::new(hmac::HMAC_SHA256, reset_key);
-    // Connection ids are checked before a stateless reset is sent, so those of the predecessor must
-    // pass: their key is derived from the one that is kept.
+    // Connection ids are checked before a stateless reset is sent, so the predecessor's connection ids must be
+    // accepted: their key is derived from the key that is kept.
     let tag = hmac::sign(&key, b"connection ids");
     let mut config = EndpointConfig::new(Arc::new(ResetKey(key)));
     let mut seed = [0; 8];
     seed.copy_from_slice(&tag.as_ref()[..8]);
     let seed = u64::from_be_bytes(seed);
     config.cid_generator(move || Box::new(HashedConnectionIdGenerator::from_key(seed)));
-    // The first two bits tell QUIC from discovery, so the fixed bit stays what it is.
+    // The first two bits separate QUIC from discovery, so the fixed bit must keep its value.
     config.grease_quic_bit(false);
     config.supported_versions(vec![1]);
     config
 }
 
-/// The longest time for which a peer may keep an acknowledgement of a lone packet. QUIC's default is 25 ms, which
-/// would be most of a round trip on a local path: the time after which a lost packet is sent again grows with it.
+/// The longest time for which a peer may delay the acknowledgement of a lone packet. QUIC's default of 25 ms would be
+/// most of a round trip on a local path, and the retransmit timeout grows with it.
 const ACK_DELAY: Duration = Duration::from_millis(2);
-/// A packet in so many is acknowledged at once, as is usual. Under heavy loss each acknowledgement counts.
+/// Most packets that a peer may receive without an immediate acknowledgement; this is the usual number. Under heavy
+/// loss each acknowledgement counts.
 const ACK_THRESHOLD: u32 = 1;
-/// The round trip that is assumed of a private path until one was measured. QUIC's default of 333 ms is for the
-/// Internet: with it, a first packet that is lost delays the link by a second.
+/// The round trip that is assumed for a private path until one was measured. QUIC's default of 333 ms is for the
+/// Internet: with it, the loss of a first packet delays the link by a second.
 const PRIVATE_RTT: Duration = Duration::from_millis(50);
 
-/// The transport settings of links, which depend on where the peer is.
+/// The transport settings of links, which depend on the peer's address.
 pub(crate) struct Transports {
-    /// For private and link-local addresses.
+    /// Settings for private and link-local addresses.
     private: Arc<TransportConfig>,
-    /// For all others.
+    /// Settings for all other addresses.
     other: Arc<TransportConfig>,
 }
 
 impl Transports {
-    /// The settings of `config`.
+    /// Returns the settings of `config`.
     pub(crate) fn new(config: &Config) -> Self {
         Self {
             private: Arc::new(transport(config, true)),
@@ -100,12 +102,12 @@ impl Transports {
         }
     }
 
-    /// The settings of a link to this address.
+    /// Returns the settings of a link to this address.
     pub(crate) fn towards(&self, address: IpAddr) -> Arc<TransportConfig> {
         Arc::clone(if is_private(address) { &self.private } else { &self.other })
     }
 
-    /// The same for one link, whose events are written.
+    /// Returns the settings of one link to this address, which writes its events to `stream`.
     pub(crate) fn logged(
         config: &Config,
         stream: QlogStream,
@@ -117,8 +119,8 @@ impl Transports {
     }
 }
 
-/// Whether an address is one of a robot's own networks. Loopback is not: it loses no packet that its receiver has
-/// room for, and has no queue but the receiver's.
+/// Returns whether an address belongs to a robot's own networks. Loopback does not: it loses no packet that its
+/// receiver has room for, and has no queue but the receiver's.
 fn is_private(address: IpAddr) -> bool {
     match address.to_canonical() {
         IpAddr::V4(v4) => v4.is_private() || v4.is_link_local(),
@@ -156,7 +158,7 @@ fn transport(config: &Config, is_private: bool) -> TransportConfig {
     transport
 }
 
-/// Has a link use this congestion controller.
+/// Sets the congestion controller of a link.
 fn control<F>(transport: &mut TransportConfig, factory: F)
 where
     F: ControllerFactory + Send + Sync + 'static,

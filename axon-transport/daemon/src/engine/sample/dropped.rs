@@ -135,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn a_publisher_is_told_of_no_fewer_than_were_dropped_however_many_runs_there_were() {
+    fn report_of_drops_never_undercounts() {
         for newest in [100, 1_000, 100_000] {
             tells_enough(newest, |number| number % 2 == 0);
             tells_enough(newest, |number| number % 7 == 3);

@@ -120,7 +120,7 @@ mod tests {
     }
 
     #[test]
-    fn a_sample_that_was_on_its_way_for_long_leaves_the_next_one_its_number() {
+    fn late_sample_does_not_take_the_number_of_the_next_one() {
         let numbers = PublisherNumbers::new(at(0));
         // A link was cut for 100 s: the sample from before comes with the newest one.
         numbers.pass(1, at(0));

@@ -247,7 +247,7 @@ async fn silent_kme_is_given_up_after_the_answer_limit_of_the_settings() {
 
 /// As above. The kernel takes the connection, and nobody speaks TLS.
 #[tokio::test]
-async fn kme_that_takes_no_connection_is_given_up_after_the_connect_limit_of_the_settings() {
+async fn unreachable_kme_is_given_up_after_the_connect_timeout() {
     let network = network().await;
     let dir = tempfile::tempdir().unwrap();
     let settings = config(&network, "sae-a", dir.path());

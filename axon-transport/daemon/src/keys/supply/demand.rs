@@ -1,4 +1,4 @@
-//! Measures how many keys the messages need, and decides how many keys are fetched ahead.
+//! Measures the keys per second that the messages need, and decides how many keys are fetched ahead.
 
 use std::{fmt, time::Duration};
 
@@ -6,26 +6,26 @@ use axon_envelope::MESSAGES_PER_KEY;
 
 use super::MAX_UNRETIRED;
 
-/// Bounds of the keys held ahead.
+/// Bounds of the number of keys held ahead.
 const AHEAD: std::ops::RangeInclusive<usize> = 4..=256;
 const _: () = assert!(*AHEAD.end() < MAX_UNRETIRED, "what is drawn can be announced");
 /// Lead time assumed before one was measured.
 const FIRST_LEAD: Duration = Duration::from_millis(100);
-/// How fast the number of keys ahead follows the demand.
+/// Time constant with which the number of keys ahead follows the demand.
 const QUICK: Duration = Duration::from_secs(1);
-/// Over what time demand is compared with supply.
+/// Time constant of the demand that is compared with the supply.
 const STEADY: Duration = Duration::from_secs(10);
-/// At what share of the supply the demand is too close to it.
+/// Share of the supply above which the demand is too close to it.
 const CLOSE: f64 = 0.8;
-/// Time between two warnings.
+/// Minimum time between two warnings.
 const WARN_EVERY: Duration = Duration::from_secs(10);
 
-/// The keys that are asked for come close to what the KME gives.
+/// A warning that the messages need nearly as many keys as the KME gives.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SupplyWarning {
-    /// Keys a second that the messages need.
+    /// Keys per second that the messages need.
     pub demand: f64,
-    /// Keys a second that the KME gives.
+    /// Keys per second that the KME gives.
     pub supply: f64,
 }
 
@@ -41,7 +41,7 @@ impl fmt::Display for SupplyWarning {
     }
 }
 
-/// A rate that forgets with time constant `window`.
+/// A rate that decays with time constant `window`.
 struct Rate {
     window: Duration,
     value: f64,
@@ -68,7 +68,7 @@ impl Rate {
 pub(super) struct Demand {
     quick: Rate,
     steady: Rate,
-    /// From asking for a key to READY.
+    /// The time from the request for a key to READY, in seconds.
     lead: Option<f64>,
     warned: Option<Duration>,
 }
@@ -78,20 +78,20 @@ impl Demand {
         Self { quick: Rate::new(QUICK), steady: Rate::new(STEADY), lead: None, warned: None }
     }
 
-    /// `messages` are to be sent.
+    /// Counts `messages` that are to be sent.
     pub(super) fn messages(&mut self, now: Duration, messages: u32) {
         let keys = f64::from(messages) / f64::from(MESSAGES_PER_KEY);
         self.quick.add(now, keys);
         self.steady.add(now, keys);
     }
 
-    /// A key became READY `lead` after it was asked for.
+    /// Records that a key became READY `lead` after its request.
     pub(super) fn ready(&mut self, lead: Duration) {
         let new = lead.as_secs_f64();
         self.lead = Some(self.lead.map_or(new, |old| old + (new - old) / 4.0));
     }
 
-    /// Keys that should be on their way or ready, beyond the one in use.
+    /// Returns the number of keys that should be in flight or ready, beyond the key in use.
     pub(super) fn ahead(&self, now: Duration) -> usize {
         let keys = 2.0 * self.quick.get(now) * self.lead_time().as_secs_f64();
         (keys.ceil() as usize).clamp(*AHEAD.start(), *AHEAD.end())
@@ -101,12 +101,12 @@ impl Demand {
         self.lead.map_or(FIRST_LEAD, Duration::from_secs_f64)
     }
 
-    /// Keys a second that the messages need.
+    /// Returns the keys per second that the messages need.
     pub(super) fn demand(&self, now: Duration) -> f64 {
         self.steady.get(now)
     }
 
-    /// Says that the demand comes close to `supply`, the keys a second that the KME gives.
+    /// Returns a warning if it is due and the demand comes close to `supply`, the keys per second that the KME gives.
     pub(super) fn warning(&mut self, now: Duration, supply: f64) -> Option<SupplyWarning> {
         let demand = self.demand(now);
         let due = self.warned.is_none_or(|at| now.saturating_sub(at) >= WARN_EVERY);
@@ -118,8 +118,8 @@ impl Demand {
     }
 }
 
-/// Of `target` keys ahead, those kept for RELIABLE and services: the last max(2, 25 %), as long as
-/// that leaves any.
+/// Returns the number of keys that are reserved for RELIABLE and services, of `target` keys ahead: max(2, 25 %), as
+/// long as that leaves any.
 pub(super) fn reserve(target: usize) -> usize {
     (target / 4).max(2).min(target.saturating_sub(1))
 }
@@ -132,7 +132,7 @@ mod tests {
         Duration::from_millis(millis)
     }
 
-    /// `per_second` messages for ten seconds, from time `from`.
+    /// Counts `per_second` messages for ten seconds, from time `from`. Returns the end of that time.
     fn run(demand: &mut Demand, from: u64, per_second: u64) -> Duration {
         for i in 0..per_second * 10 {
             demand.messages(ms(from + i * 1000 / per_second), 1);

@@ -4,15 +4,15 @@ use std::{fmt, time::Duration};
 
 use axon_envelope::KeyId;
 
-/// Time between two reports.
+/// Minimum time between two reports.
 const REPORT_EVERY: Duration = Duration::from_secs(10);
 
-/// The peer holds other keys under these key_IDs.
+/// A report that the peer holds other keys under the same key_IDs.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Disagreement {
-    /// The last one.
+    /// The key_ID of the last such key.
     pub key_id: KeyId,
-    /// How many, since the last report.
+    /// The number of such keys since the last report.
     pub keys: u64,
 }
 
@@ -26,7 +26,7 @@ impl fmt::Display for Disagreement {
     }
 }
 
-/// Collects what is to be reported.
+/// The keys that have to be reported.
 #[derive(Default)]
 pub(super) struct Disagreements {
     pending: Option<Disagreement>,

@@ -26,26 +26,26 @@ use super::KeyViolation;
 /// Most keys of one direction that are announced and not retired.
 pub const MAX_UNRETIRED: usize = 4096;
 
-/// Why the supply of a link stops.
+/// The reason for which the supply of a link stops.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum SupplyError {
-    /// The peer broke a rule.
+    /// The peer violated the protocol.
     #[error(transparent)]
     Violation(#[from] KeyViolation),
-    /// The SAE IDs make no channel.
+    /// The SAE IDs do not make a channel.
     #[error(transparent)]
     Channel(#[from] ChannelError),
-    /// The system gave no random bytes.
+    /// The system returned no random bytes.
     #[error(transparent)]
     Random(#[from] RandomError),
-    /// A message came on a connection that is not attached.
+    /// A message arrived on a connection that is not attached.
     #[error("connection {0} is not attached to this supply")]
     Unattached(u64),
 }
 
 impl SupplyError {
-    /// The application error code to close the connection with (docs/formats.md, section 6).
+    /// Returns the application error code to close the connection with (docs/formats.md, section 6).
     pub fn code(&self) -> u64 {
         match self {
             Self::Violation(violation) => violation.code(),

@@ -11,73 +11,73 @@ use crate::{
     wire::keys::announceable,
 };
 
-/// Most keys a call asks for: what a call that is cut off can lose.
+/// Most keys of one call, and so the most keys that an interrupted call can lose.
 const PER_CALL: u32 = 8;
-/// Calls for keys in flight.
+/// Most calls for keys in flight.
 const IN_FLIGHT: usize = 4;
-/// Pause after keys that the peer could not use, first and longest: each is gone for good. It
-/// doubles with each round that no READY makes up for. A round is all keys that were announced
-/// before the first of them was refused, since they fail for the same cause.
+/// First and longest pause after keys that the peer could not use: each such key is lost for good. The pause doubles
+/// with each round that no READY compensates. A round is all keys that were announced before the first of them was
+/// refused, because they fail for the same cause.
 const REFUSED: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(30));
-/// READYs that make up for one round.
+/// READYs that compensate one round.
 const MAKE_UP: u32 = 4;
-/// Rounds that are remembered, so that a peer that is well again is served again soon.
+/// Most rounds that are counted, so that a recovered peer is served again soon.
 const ROUNDS_MAX: u32 = 10;
-/// Rounds in a row after which no more than [`FEW_KEYS`] keys are had ahead, until one is READY.
+/// Consecutive rounds after which at most [`FEW_KEYS`] keys are held ahead, until one is READY.
 const ROUNDS_OF_MANY: u32 = 2;
-/// See [`ROUNDS_OF_MANY`].
+/// Most keys held ahead after [`ROUNDS_OF_MANY`].
 const FEW_KEYS: usize = 4;
 
-/// A key that no connection knows of.
+/// A key that is not announced on any connection.
 pub(super) struct UnusedKey {
     pub(super) key_id: KeyId,
     pub(super) key: KmeKey,
-    /// When it was asked for, where its lead time is to be measured.
+    /// The time of its request, if its lead time is to be measured.
     pub(super) asked: Option<Duration>,
-    /// When it was first announced, where no connection has answered for it yet.
+    /// The time of its first announcement, if no connection has answered for it yet.
     pub(super) announced: Option<Duration>,
 }
 
 /// The keys of one sending direction before they are announced.
 pub(super) struct KeyStock {
     core: Core<UnusedKey>,
-    /// Key_IDs of this direction, so that a KME that repeats itself has no key used twice.
+    /// The key_IDs of this direction. They prevent a second use of a key that the KME repeats.
     seen: Ledger,
-    /// Rounds of refused keys that no READY made up for.
+    /// Rounds of refused keys that no READY compensated.
     rounds: u32,
-    /// When the last round was refused.
+    /// The time of the last refused round.
     refused: Option<Duration>,
-    /// READYs since a round was made up for.
+    /// READYs since the last compensated round.
     readied: u32,
-    /// Whether the last call for keys brought none, and the peer has refused none since.
+    /// True if the last call for keys brought none, and the peer has refused none since.
     fails: bool,
 }
 
 impl KeyStock {
-    /// `jitter` gives a random byte for each pause after a failure.
+    /// Creates an empty stock. `jitter` returns a random byte for each pause after a failure.
     pub(super) fn new(jitter: impl FnMut() -> u8 + Send + 'static) -> Self {
         let mut settings = Settings::default();
         settings.batch = PER_CALL;
         settings.calls = IN_FLIGHT;
-        // A key ages from its first use on, and that is the sender's to watch.
+        // A key ages only from its first use on, and the sender checks its age.
         settings.max_age = Duration::MAX;
         let (core, seen) = (Core::new(settings, jitter), Ledger::default());
         Self { core, seen, rounds: 0, refused: None, readied: 0, fails: false }
     }
 
-    /// `ahead` keys are to be on their way or ready, where `elsewhere` of them are the sender's.
+    /// Sets the number of keys in flight or ready to `ahead`. The sender has `elsewhere` of them.
     pub(super) fn plan(&mut self, ahead: usize, elsewhere: usize) {
         let few = self.rounds >= ROUNDS_OF_MANY;
         self.core.set_target(if few { ahead.min(FEW_KEYS) } else { ahead });
         self.core.set_elsewhere(elsewhere);
     }
 
-    /// What was planned, within the KME's stock. At least 1.
+    /// Returns the planned number of keys, within the KME's stock. At least 1.
     pub(super) fn target(&self) -> usize {
         self.core.target()
     }
 
-    /// The next call, if any.
+    /// Returns the next call, if any.
     pub(super) fn poll(&mut self, now: Duration, peer: &str) -> Option<KmeRequest> {
         let ask = self.core.poll(now)?;
         let slave = peer.to_owned();
@@ -87,12 +87,12 @@ impl KeyStock {
         })
     }
 
-    /// When [`poll`](Self::poll) may give something without an answer before.
+    /// Returns when [`poll`](Self::poll) may return a call without an answer before.
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
         self.core.poll_timeout()
     }
 
-    /// Takes the answer to one of the pool's calls. Says what was wrong with it, if anything was.
+    /// Handles the answer to one of the pool's calls. Returns the fault of the answer, if it has one.
     pub(super) fn handle_answer(&mut self, now: Duration, answer: Answer) -> Option<String> {
         let asked = now.saturating_sub(answer.took);
         let ask = match answer.request {
@@ -127,7 +127,7 @@ impl KeyStock {
         }
     }
 
-    /// Those of `keys` that may be announced, and why another may not.
+    /// Returns the keys that may be announced, and the reason for which another key may not.
     fn usable(
         &self,
         asked: Duration,
@@ -146,10 +146,10 @@ impl KeyStock {
         (usable, refused)
     }
 
-    /// Whether a key may be used: its key_ID can be announced, and was never there before.
+    /// Records the key_ID of a key that is to be used: it must be announceable, and new to this direction.
     ///
     /// # Errors
-    /// Why not.
+    /// The reason for which the key may not be used.
     pub(super) fn admit(&self, key_id: &KeyId) -> Result<(), String> {
         let text = announceable(key_id)
             .ok_or_else(|| format!("key_ID {key_id} is no text of at most 128 bytes"))?;
@@ -160,30 +160,30 @@ impl KeyStock {
         }
     }
 
-    /// Whether the KME gives no keys, and the peer refused none since that it gave.
+    /// Returns whether the last call for keys brought none, and the peer has refused none since.
     pub(super) fn fails(&self) -> bool {
         self.fails
     }
 
-    /// Takes out the key to announce next.
+    /// Takes the next key to announce.
     pub(super) fn take(&mut self, now: Duration) -> Option<UnusedKey> {
         self.core.take(now)
     }
 
-    /// Takes in a key that was drawn elsewhere, as the newest.
+    /// Adds a key that was drawn by another part, as the newest key.
     pub(super) fn put(&mut self, now: Duration, key_id: KeyId, key: KmeKey) {
         self.core.put(now, UnusedKey { key_id, key, asked: None, announced: None });
     }
 
-    /// Takes back a key that nothing was sealed under, to be announced before all others: the peer
-    /// may hold it already. `announced`: since when the peer owes an answer for it.
+    /// Puts back a key that sealed nothing. It is announced before all others, because the peer may hold it already.
+    /// `announced`: the time since which the peer owes an answer for it.
     pub(super) fn put_back(&mut self, key_id: KeyId, key: KmeKey, announced: Option<Duration>) {
         self.core.put(Duration::ZERO, UnusedKey { key_id, key, asked: None, announced });
     }
 
-    /// The peer could not use a key that was `announced` then, or did not answer for it.
+    /// Handles a key that was `announced` at that time and that the peer could not use, or did not answer for.
     pub(super) fn key_refused(&mut self, now: Duration, announced: Duration) {
-        // That there is no key is the peer's doing.
+        // The peer caused the lack of keys, not the KME.
         self.fails = false;
         if self.refused.is_some_and(|at| announced <= at) {
             return;
@@ -195,7 +195,7 @@ impl KeyStock {
         self.core.hold_until(now.saturating_add(pause));
     }
 
-    /// The peer readied a key.
+    /// Handles a key that the peer readied.
     pub(super) fn key_ready(&mut self) {
         self.readied += 1;
         if self.readied >= MAKE_UP {
@@ -204,13 +204,13 @@ impl KeyStock {
         }
     }
 
-    /// How it stands.
+    /// Returns the status of the pool.
     pub(super) fn status(&self, now: Duration) -> PoolStatus {
         self.core.status(now)
     }
 }
 
-/// What a failed call cost.
+/// Returns the class of a failed call, which states the loss that it caused.
 fn class(kind: FailureKind) -> FailureClass {
     match kind {
         FailureKind::Ambiguous | FailureKind::Repeated => FailureClass::KeysLost,

@@ -18,9 +18,9 @@ use crate::keys::{
     request::{Answer, KeyPurpose, KmeRequest},
 };
 
-/// How long unused keys of a lost connection wait to be announced on the next one.
+/// The time for which unused keys of a lost connection wait to be announced on the next one.
 const KEY_RETENTION: Duration = Duration::from_secs(120);
-/// How many of them.
+/// Most of these waiting keys.
 const MAX_RETAINED_KEYS: usize = 512;
 
 /// The keys of one peer's messages to this host.
@@ -28,19 +28,20 @@ pub struct KeyReceiver {
     local: String,
     peer: String,
     links: HashMap<u64, ReceiverLink>,
-    /// Connections that were elected so far.
+    /// The number of connections that were elected so far.
     elected: u64,
-    /// Being fetched, with the connection that last announced it. The answer goes there.
+    /// Keys that are being fetched, each with the connection that last announced it. The answer goes there.
     wanted: HashMap<KeyId, u64>,
     fetches: Fetches,
-    /// Never used, from connections that are gone.
+    /// Unused keys of closed connections.
     kept: VecDeque<(Duration, KeyId, KmeKey)>,
     outbox: VecDeque<(u64, KeyMessage)>,
     counts: ReceiverCounts,
 }
 
 struct ReceiverLink {
-    /// Its place in the order in which connections were elected, which is the same on both hosts; 0 is none.
+    /// The link's place in the order in which connections were elected, which is the same on both hosts; 0 if it was
+    /// not elected.
     order: u64,
     opener: Opener,
     ready: Exporter,
@@ -62,11 +63,11 @@ impl ReceiverCounts {
     }
 }
 
-/// How a [`KeyReceiver`] stands, for status.
+/// The statistics of a [`KeyReceiver`], for status.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
 pub struct ReceiverStatistics {
-    /// Keys held and not retired, on all connections.
+    /// Keys that are held and not retired, on all connections.
     pub held: usize,
     /// Keys being fetched.
     pub fetching: usize,
@@ -76,17 +77,17 @@ pub struct ReceiverStatistics {
     pub failed: u64,
     /// Keys that the peer retired.
     pub retired: u64,
-    /// Keys that time retired.
+    /// Keys that expired.
     pub expired: u64,
-    /// Messages that the peer says it sealed and that never came, under keys that are retired.
+    /// Messages that the peer reports as sealed and that never arrived, under retired keys.
     pub messages_missing: u64,
 }
 
 impl KeyReceiver {
-    /// For what `peer_sae` sends to `local_sae`.
+    /// Creates the receiver of the messages that `peer_sae` sends to `local_sae`.
     ///
     /// # Errors
-    /// SAE IDs that make no channel: empty, too long, equal.
+    /// The SAE IDs do not make a channel: one is empty or too long, or both are equal.
     pub fn new(local_sae: &str, peer_sae: &str) -> Result<Self, ChannelError> {
         Channel::new(peer_sae, local_sae, [])?;
         Ok(Self {
@@ -102,10 +103,10 @@ impl KeyReceiver {
         })
     }
 
-    /// Takes on a connection. One that it succeeds may stay attached until it is closed.
+    /// Attaches a connection. A connection that it succeeds may stay attached until it is closed.
     ///
     /// # Errors
-    /// The system gives no random bytes.
+    /// The system returns no random bytes.
     pub fn attach(
         &mut self,
         now: Duration,
@@ -120,7 +121,7 @@ impl KeyReceiver {
         Ok(())
     }
 
-    /// Both hosts use this connection from now on: the peer announces its keys there, and on no other one.
+    /// Records that both hosts use this connection from now on: the peer announces its keys there, and on no other one.
     pub fn elect(&mut self, conn: u64) {
         if let Some(link) = self.links.get_mut(&conn) {
             self.elected += 1;
@@ -128,8 +129,8 @@ impl KeyReceiver {
         }
     }
 
-    /// A connection is closed: nothing opens on it any more. Keys under which nothing was opened
-    /// wait a while to be announced on the next.
+    /// Detaches a closed connection: no message opens on it any more. Keys that opened no message wait a while to be
+    /// announced on the next connection.
     pub fn detach(&mut self, now: Duration, conn: u64) {
         let Some(mut link) = self.links.remove(&conn) else { return };
         self.outbox.retain(|(c, _)| *c != conn);
@@ -142,15 +143,15 @@ impl KeyReceiver {
         }
     }
 
-    /// Opens what comes on this connection.
+    /// Returns the opener of the messages on this connection.
     pub fn opener(&mut self, conn: u64) -> Option<&mut Opener> {
         self.links.get_mut(&conn).map(|link| &mut link.opener)
     }
 
-    /// ANNOUNCE or RETIRE from the peer.
+    /// Handles ANNOUNCE or RETIRE from the peer.
     ///
     /// # Errors
-    /// The peer broke a rule, or the connection is not attached.
+    /// The peer violated the protocol, or the connection is not attached.
     pub fn handle_message(
         &mut self,
         now: Duration,
@@ -180,20 +181,20 @@ impl KeyReceiver {
         }
     }
 
-    /// What is to be sent next, and on which connection.
+    /// Returns the next message to send, and its connection.
     pub fn poll_message(&mut self) -> Option<(u64, KeyMessage)> {
         self.outbox.pop_front()
     }
 
-    /// The next call to the KME, if any.
+    /// Returns the next call to the KME, if any.
     pub fn poll_request(&mut self, now: Duration) -> Option<KmeRequest> {
         self.fetches.poll_request(now)
     }
 
-    /// The KME's answer to one of our requests.
+    /// Handles the KME's answer to one of this host's requests.
     pub fn handle_answer(&mut self, now: Duration, answer: Answer) {
         for (key_id, outcome) in self.fetches.handle_answer(now, answer) {
-            // Retired meanwhile: nobody waits for it.
+            // The key was retired meanwhile: no connection waits for it.
             let Some(conn) = self.wanted.remove(&key_id) else { continue };
             match outcome {
                 Ok(key) if self.links.contains_key(&conn) => self.add(conn, key_id, key),
@@ -203,12 +204,12 @@ impl KeyReceiver {
         }
     }
 
-    /// When to poll again without other cause.
+    /// Returns when to poll again without other cause.
     pub fn poll_timeout(&self) -> Option<Duration> {
         self.fetches.poll_timeout()
     }
 
-    /// Erases what time has retired; to be called about once a second.
+    /// Erases expired keys; to be called about once a second.
     pub fn handle_timeout(&mut self, now: Duration) {
         for link in self.links.values_mut() {
             self.counts.add(link.opener.expire(now));
@@ -216,7 +217,7 @@ impl KeyReceiver {
         self.kept.retain(|(since, ..)| now.saturating_sub(*since) < KEY_RETENTION);
     }
 
-    /// How it stands.
+    /// Returns the statistics.
     pub fn statistics(&self) -> ReceiverStatistics {
         ReceiverStatistics {
             held: self.links.values().map(|l| l.opener.key_count()).sum(),
@@ -229,7 +230,7 @@ impl KeyReceiver {
         }
     }
 
-    /// Deals with one announced key_ID; true where it has to be fetched.
+    /// Handles one announced key_ID. Returns true if the key has to be fetched.
     fn announced(&mut self, conn: u64, key_id: &KeyId) -> bool {
         if self.links.get(&conn).is_some_and(|l| l.opener.contains(key_id.as_bytes())) {
             self.fail(conn, key_id.clone(), "announced twice".to_owned());
@@ -239,7 +240,7 @@ impl KeyReceiver {
         let (this, waiting) = (order(&conn), self.wanted.get(key_id).map(order));
         let holds = |link: &&ReceiverLink| link.opener.contains(key_id.as_bytes());
         let held = self.links.values().find(holds).map(|link| link.order);
-        // The sender announced it on a later connection meanwhile, and seals for that one.
+        // The sender announced the key on a later connection meanwhile, and seals for that one.
         if held.max(waiting).is_some_and(|order| order > this) {
             return false;
         }
@@ -260,7 +261,7 @@ impl KeyReceiver {
         true
     }
 
-    /// A key that was announced before and never used, from another connection or one that is gone.
+    /// Takes a key that was announced before and never used, from another connection or a closed one.
     fn take_unused(&mut self, key_id: &KeyId) -> Option<KmeKey> {
         if let Some(i) = self.kept.iter().position(|(_, id, _)| id == key_id) {
             return self.kept.remove(i).map(|(_, _, key)| key);

@@ -28,8 +28,8 @@ use crate::{
     wire::keys::MAX_ANNOUNCED,
 };
 
-/// How long an announced key waits for READY or FAILED, over all connections that it is announced
-/// on: the receiver's tries, and more.
+/// The longest wait for READY or FAILED of an announced key, over all connections that it is announced on. It is longer
+/// than the receiver's attempts.
 const ANSWER_WITHIN: Duration = Duration::from_secs(60);
 
 /// The keys of this host's messages to one peer.
@@ -37,12 +37,12 @@ pub struct KeySender {
     local: String,
     peer: String,
     link: Option<SenderLink>,
-    /// Drawn or being drawn, to be announced.
+    /// Keys that are drawn or being drawn, and have to be announced.
     pool: KeyStock,
     announced: HashMap<KeyId, Announced>,
-    /// READY, in the order of use. Only the first may have sealed anything.
+    /// READY keys, in the order of use. Only the first may have sealed messages.
     ready: VecDeque<Sealer>,
-    /// When the first of `ready` was first handed out.
+    /// The time at which the first key of `ready` was first handed out.
     begun: Option<Duration>,
     outbox: VecDeque<(u64, KeyMessage)>,
     demand: Demand,
@@ -59,7 +59,7 @@ struct SenderLink {
 struct Announced {
     key: KmeKey,
     asked: Option<Duration>,
-    /// When it was announced first, on whatever connection.
+    /// The time of its first announcement, on any connection.
     since: Duration,
 }
 
@@ -73,14 +73,14 @@ struct SenderCounts {
     last_failure: Option<String>,
 }
 
-/// Why no message can be sealed now.
+/// The reason for which no message can be sealed now.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum NoKey {
     /// No key is READY.
     #[error("no_key: no key is ready")]
     None,
-    /// Those that are READY are kept for RELIABLE and services.
+    /// The READY keys are reserved for RELIABLE and services.
     #[error("no_key: the last keys are kept for RELIABLE and services")]
     Reserved,
     /// There is no connection.
@@ -88,48 +88,48 @@ pub enum NoKey {
     Detached,
 }
 
-/// How a [`KeySender`] stands, for status. Rates are keys a second.
+/// The statistics of a [`KeySender`], for status. Rates are keys per second.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[non_exhaustive]
 pub struct SenderStatistics {
-    /// Keys that are READY, with the one in use.
+    /// Keys that are READY, including the key in use.
     pub ready: usize,
-    /// Keys announced and not answered.
+    /// Keys that are announced and not answered.
     pub announced: usize,
-    /// Keys asked for and not there.
+    /// Keys that are requested and have not arrived.
     pub asked: usize,
-    /// Keys that should be on their way or READY, within the KME's stock.
+    /// The number of keys that should be in flight or READY, within the KME's stock.
     pub target: usize,
-    /// Keys that the messages need.
+    /// Keys per second that the messages need.
     pub demand: f64,
-    /// Keys that the KME gives, where it was seen at its limit.
+    /// Keys per second that the KME gives, if the KME was observed at its limit.
     pub supply: Option<f64>,
-    /// From asking for a key to READY.
+    /// The time from the request for a key to READY, in milliseconds.
     pub lead_ms: f64,
-    /// Messages sealed under keys that are retired.
+    /// Messages that were sealed under retired keys.
     pub sealed: u64,
-    /// Keys retired.
+    /// Retired keys.
     pub retired: u64,
     /// Keys that the peer could not fetch or did not answer, or that the KME gave before.
     pub failed: u64,
-    /// Keys whose proof did not fit: the peer's KME gave it another key under the same key_ID.
+    /// Keys whose proof did not match: the peer's KME gave it another key under the same key_ID.
     pub disagreed: u64,
-    /// How often a message was refused for want of a key.
+    /// The number of times that a message was refused for lack of a key.
     pub no_key: u64,
-    /// Why the last key or call failed.
+    /// The reason for which the last key or call failed.
     pub last_failure: Option<String>,
 }
 
 impl KeySender {
-    /// For what `local_sae` sends to `peer_sae`.
+    /// Creates the sender of the messages that `local_sae` sends to `peer_sae`.
     ///
     /// # Errors
-    /// SAE IDs that make no channel: empty, too long, equal.
+    /// The SAE IDs do not make a channel: one is empty or too long, or both are equal.
     pub fn new(local_sae: &str, peer_sae: &str) -> Result<Self, ChannelError> {
         Self::with_jitter(local_sae, peer_sae, rand::random)
     }
 
-    /// With `jitter` as a random byte for each pause after a failed call.
+    /// Creates a sender. `jitter` returns a random byte for each pause after a failed call.
     pub(super) fn with_jitter(
         local_sae: &str,
         peer_sae: &str,
@@ -153,12 +153,12 @@ impl KeySender {
         Ok(sender)
     }
 
-    /// Moves to a new connection. Keys under which nothing was sealed are announced again there;
-    /// a begun one is retired. Returns the RETIREs that are owed on the connection before, each
-    /// with that connection: to be sent there, if it is open, and nowhere else.
+    /// Moves to a new connection. Keys that sealed no message are announced again there; a key in use is retired.
+    /// Returns the RETIREs that are owed on the connection before, each with that connection. The caller sends them
+    /// there, if that connection is open, and nowhere else.
     ///
     /// # Errors
-    /// The SAE IDs make no channel.
+    /// The SAE IDs do not make a channel.
     pub fn attach(
         &mut self,
         now: Duration,
@@ -173,7 +173,7 @@ impl KeySender {
         Ok(owed)
     }
 
-    /// A connection is closed. Keys under which nothing was sealed wait for the next.
+    /// Detaches a closed connection. Keys that sealed no message wait for the next connection.
     pub fn detach(&mut self, now: Duration, conn: u64) {
         if self.link.as_ref().is_some_and(|link| link.conn == conn) {
             self.unbind(now);
@@ -182,16 +182,16 @@ impl KeySender {
         }
     }
 
-    /// The connection that [`slot`](Self::slot) seals for. What is sealed opens on no other.
+    /// Returns the connection that [`slot`](Self::slot) seals for. The sealed messages open on no other connection.
     pub fn attached(&self) -> Option<u64> {
         self.link.as_ref().map(|link| link.conn)
     }
 
-    /// Takes on a key that the peer has proven to hold on `conn`, as READY. One that was there
-    /// before, or is one too many, is dropped.
+    /// Adds a key that the peer has proven to hold on `conn`, as READY. The key is dropped if it was used before, or if
+    /// there are too many keys.
     ///
     /// # Errors
-    /// The system gives no random bytes.
+    /// The system returns no random bytes.
     pub fn adopt(
         &mut self,
         now: Duration,
@@ -215,16 +215,16 @@ impl KeySender {
         Ok(())
     }
 
-    /// `messages` more are to be sent to this peer. Once for each, however often it is tried.
+    /// Counts `messages` more that are to be sent to this peer. Each message counts once, however often it is tried.
     pub fn demand(&mut self, now: Duration, messages: u32) {
         self.demand.messages(now, messages);
     }
 
-    /// A permit to seal one message, at once and on the attached connection. Services seal as
+    /// Returns a permit to seal one message, at once and on the attached connection. Services seal as
     /// [`Delivery::Reliable`].
     ///
     /// # Errors
-    /// [`NoKey`]. Never an eleventh message under a key, never a key that is not READY.
+    /// [`NoKey`]. No key seals an eleventh message, and only READY keys seal.
     pub fn slot(&mut self, now: Duration, delivery: Delivery) -> Result<Slot<'_>, NoKey> {
         self.settle(now);
         self.plan(now);
@@ -237,13 +237,13 @@ impl KeySender {
         first.slot(now, delivery).map_err(|_| NoKey::None)
     }
 
-    /// Bytes that an envelope has more than its plaintext: an upper bound for the next
-    /// [`slot`](Self::slot), since KMEs name keys as they like.
+    /// Returns the bytes that an envelope has in addition to its plaintext. It is an upper bound for the next
+    /// [`slot`](Self::slot), because KMEs choose the names of keys.
     pub fn overhead(&self) -> usize {
         self.ready.iter().map(Sealer::overhead).max().unwrap_or(MAX_HEADER_LEN + TAG_LEN)
     }
 
-    /// How many messages could be sealed now, as the keys to keep were last planned.
+    /// Returns the number of messages that could be sealed now, with the reserved keys as last planned.
     pub fn available(&self, delivery: Delivery) -> u32 {
         if self.allowed(delivery).is_err() {
             return 0;
@@ -256,19 +256,18 @@ impl KeySender {
         all.saturating_sub(kept)
     }
 
-    /// READY or FAILED from the peer. A proof that does not fit retires its key and nothing else:
-    /// the peer's KME may have given it another one, which [`disagreement`](Self::disagreement)
-    /// reports.
+    /// Handles READY or FAILED from the peer. A proof that does not match retires its key and nothing else: the peer's
+    /// KME may have given it another key, which [`disagreement`](Self::disagreement) reports.
     ///
     /// # Errors
-    /// The peer broke a rule, or the system gives no random bytes.
+    /// The peer violated the protocol, or the system returns no random bytes.
     pub fn handle_message(
         &mut self,
         now: Duration,
         conn: u64,
         message: &KeyMessage,
     ) -> Result<(), SupplyError> {
-        // What comes late on a connection before is about keys that were announced anew.
+        // A late message on an earlier connection concerns keys that were announced again.
         let Some(link) = self.link.as_ref().filter(|link| link.conn == conn) else {
             return Ok(());
         };
@@ -303,7 +302,7 @@ impl KeySender {
         }
     }
 
-    /// What is to be sent next, and on which connection.
+    /// Returns the next message to send, and its connection.
     pub fn poll_message(&mut self, now: Duration) -> Option<(u64, KeyMessage)> {
         self.settle(now);
         self.drop_unanswered(now);
@@ -312,7 +311,7 @@ impl KeySender {
         message
     }
 
-    /// The next call to the KME, if any.
+    /// Returns the next call to the KME, if any.
     pub fn poll_request(&mut self, now: Duration) -> Option<KmeRequest> {
         self.settle(now);
         self.plan(now);
@@ -320,14 +319,14 @@ impl KeySender {
         self.pool.poll(now, &self.peer)
     }
 
-    /// The KME's answer to one of our requests.
+    /// Handles the KME's answer to one of this host's requests.
     pub fn handle_answer(&mut self, now: Duration, answer: Answer) {
         if let Some(failure) = self.pool.handle_answer(now, answer) {
             self.counts.last_failure = Some(failure);
         }
     }
 
-    /// When to poll again without other cause.
+    /// Returns when to poll again without other cause.
     pub fn poll_timeout(&self) -> Option<Duration> {
         let used = self.begun.map(|at| at + KEY_MAX_AGE);
         let unanswered = self.announced.values().map(|a| a.since + ANSWER_WITHIN).min();
@@ -335,12 +334,13 @@ impl KeySender {
         [used, unanswered, calls].into_iter().flatten().min()
     }
 
-    /// Whether nothing can be sealed since this host's KME gives no keys. Where the peer owes an answer for one, that is why.
+    /// Returns whether nothing can be sealed because this host's KME gives no keys. While the peer owes an answer for a
+    /// key, the peer is the cause instead.
     pub fn lacks_keys_of_kme(&self) -> bool {
         self.ready.is_empty() && self.announced.is_empty() && self.pool.fails()
     }
 
-    /// How it stands.
+    /// Returns the statistics.
     pub fn statistics(&self, now: Duration) -> SenderStatistics {
         let pool = self.pool.status(now);
         SenderStatistics {
@@ -360,24 +360,24 @@ impl KeySender {
         }
     }
 
-    /// Says that demand comes close to supply; at most every ten seconds.
+    /// Returns a warning if the demand comes close to the supply; at most every ten seconds.
     pub fn warning(&mut self, now: Duration) -> Option<SupplyWarning> {
         let supply = self.pool.status(now).supply?;
         self.demand.warning(now, supply)
     }
 
-    /// Reports keys that the peer holds differently; at most every ten seconds.
+    /// Returns a report of keys that the peer holds with other bytes; at most every ten seconds.
     pub fn disagreement(&mut self, now: Duration) -> Option<Disagreement> {
         self.disagreements.take(now)
     }
 
-    /// Tells the pool how many keys to have ahead, and how many of them left it.
+    /// Reports to the pool the number of keys to hold ahead, and the number of them that left it.
     fn plan(&mut self, now: Duration) {
         let elsewhere = self.announced.len() + self.unbegun();
         self.pool.plan(self.demand.ahead(now), elsewhere);
     }
 
-    /// READY keys that are kept for RELIABLE and services, as last planned.
+    /// Returns the number of READY keys that are reserved for RELIABLE and services, as last planned.
     fn reserve(&self) -> usize {
         demand::reserve(self.pool.target())
     }
@@ -414,7 +414,7 @@ impl KeySender {
         }
     }
 
-    /// Erases an announced key that nothing will be sealed under, and has the peer erase its own.
+    /// Erases an announced key that will seal no message, and asks the peer to erase its own.
     fn give_up(&mut self, now: Duration, key_id: &KeyId) {
         if let Some(refused) = self.announced.remove(key_id) {
             self.pool.key_refused(now, refused.since);
@@ -458,7 +458,7 @@ impl KeySender {
         (!key_ids.is_empty()).then_some((conn, KeyMessage::Announce(key_ids)))
     }
 
-    /// Takes all keys off the connection: the begun one ends, the others are fresh again.
+    /// Removes all keys from the connection: the key in use is retired, and the others become fresh again.
     fn unbind(&mut self, now: Duration) {
         self.settle(now);
         while let Some(sealer) = self.ready.pop_front() {
@@ -476,7 +476,7 @@ impl KeySender {
         }
     }
 
-    /// READY keys under which nothing was sealed.
+    /// Returns the number of READY keys that sealed no message.
     fn unbegun(&self) -> usize {
         self.ready.len() - usize::from(self.begun.is_some() && !self.ready.is_empty())
     }

@@ -11,17 +11,17 @@ macro_rules! close_codes {
         }
 
         impl CloseCode {
-            /// The code on the wire.
+            /// Returns the code on the wire.
             pub fn code(self) -> u32 {
                 match self { $(Self::$variant => $code,)* }
             }
 
-            /// The code's name in `docs/formats.md`.
+            /// Returns the code's name in `docs/formats.md`.
             pub fn name(self) -> &'static str {
                 match self { $(Self::$variant => $name,)* }
             }
 
-            /// The code that `code` stands for, if this version knows it.
+            /// Returns the variant for `code`, if this version knows it.
             pub fn from_code(code: u64) -> Option<Self> {
                 match code { $($code => Some(Self::$variant),)* _ => None }
             }
@@ -60,13 +60,13 @@ close_codes! {
     KeyReused = 0x21, "KEY_REUSED";
     /// An envelope was not accepted.
     Envelope = 0x22, "ENVELOPE_REFUSED";
-    /// No key could be had from the KME.
+    /// The KME gave no key.
     KeySupply = 0x23, "KEY_SUPPLY";
-    /// Bytes that are not of the protocol.
+    /// Bytes that do not follow the protocol.
     Malformed = 0x30, "MALFORMED";
-    /// A frame or message over its bound.
+    /// A frame or message above its limit.
     TooLarge = 0x31, "TOO_LARGE";
-    /// A message before its time.
+    /// A message out of order.
     OutOfOrder = 0x32, "OUT_OF_ORDER";
     /// The peer is not, or no longer, allowed.
     NotAllowed = 0x40, "NOT_ALLOWED";

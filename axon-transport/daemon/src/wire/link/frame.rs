@@ -6,40 +6,40 @@ use super::LinkMessage;
 
 /// Largest frame before both HELLOs were checked, in bytes after the length.
 pub const MAX_FRAME_BEFORE_HELLO: usize = 4 * 1024;
-/// Largest frame afterwards.
+/// Largest frame after that.
 pub const MAX_FRAME: usize = 1024 * 1024;
-/// Largest map after decompression.
+/// Largest map after decompression, in bytes.
 pub const MAX_INFLATED: usize = 4 * 1024 * 1024;
 
-/// A map smaller than this is not worth compressing.
+/// Smallest map that is compressed, in bytes.
 const COMPRESS_FROM: usize = 1024;
 const COMPRESSED: u8 = 0x80;
 const ZSTD_LEVEL: i32 = 1;
 
-/// What is wrong with a frame.
+/// A fault of a frame.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum FrameError {
-    /// Longer than allowed at this point.
+    /// The frame is longer than allowed at this point.
     #[error("a frame of {length} bytes, at most {limit} are allowed here")]
     TooLarge {
-        /// The length stated.
+        /// The stated length.
         length: usize,
-        /// The bound in force.
+        /// The limit at this point.
         limit: usize,
     },
-    /// No type byte.
+    /// The frame has no type byte.
     #[error("an empty frame")]
     Empty,
-    /// The compressed map is broken or longer than it says.
+    /// The compressed map is broken, or does not have the stated length.
     #[error("the compressed map is broken: {0}")]
     Compression(&'static str),
-    /// The map is not what its type says.
+    /// The map does not match its type.
     #[error("message type {kind}: {reason}")]
     Malformed {
         /// The type byte.
         kind: u8,
-        /// What the decoder says.
+        /// The decoder's error.
         reason: String,
     },
 }
@@ -56,12 +56,12 @@ pub fn read_length(prefix: [u8; 4], limit: usize) -> Result<usize, FrameError> {
     }
 }
 
-/// Whether `frame` (without its length) has a type that this version knows.
+/// Returns whether `frame` (without its length) has a type that this version knows.
 pub(crate) fn is_known(frame: &[u8]) -> bool {
     frame.first().is_some_and(|kind| LinkMessage::is_known(kind & !COMPRESSED))
 }
 
-/// Bytes of the map in `frame` (without its length) once it is decompressed, as the frame says.
+/// Returns the bytes of the map in `frame` (without its length) after decompression, as the frame states them.
 pub fn unpacked_length(frame: &[u8]) -> usize {
     match frame.split_first() {
         Some((kind, body)) if kind & COMPRESSED != 0 => {
@@ -72,10 +72,10 @@ pub fn unpacked_length(frame: &[u8]) -> usize {
 }
 
 impl LinkMessage {
-    /// The frame of this message with its length in front.
+    /// Returns the frame of this message with its length in front.
     ///
     /// # Errors
-    /// [`FrameError::TooLarge`] when it exceeds [`MAX_FRAME`] even compressed.
+    /// [`FrameError::TooLarge`] if it exceeds [`MAX_FRAME`] even compressed.
     pub fn to_frame(&self) -> Result<Vec<u8>, FrameError> {
         let (kind, map) = self.encode();
         let mut frame = vec![0; 4];
@@ -103,8 +103,8 @@ impl LinkMessage {
         Ok(frame)
     }
 
-    /// The message in `frame` (without its length), or `None` for a type this version does not
-    /// know. A compressed map may have at most `inflated` bytes.
+    /// Returns the message in `frame` (without its length), or `None` for a type that this version does not know. A
+    /// compressed map may have at most `inflated` bytes.
     ///
     /// # Errors
     /// [`FrameError`]; never panics, and allocates no more than `inflated` for the map.
@@ -113,7 +113,7 @@ impl LinkMessage {
         if kind & COMPRESSED == 0 {
             return Self::decode(kind, body);
         }
-        // Nothing is decompressed in order to be passed over.
+        // A frame of an unknown type is skipped without decompression.
         if !is_known(frame) {
             return Ok(None);
         }
@@ -132,13 +132,13 @@ impl LinkMessage {
     }
 }
 
-/// The CBOR map of `value`.
+/// Returns the CBOR map of `value`.
 pub(super) fn to_map<T: Encode<()>>(value: &T) -> Vec<u8> {
-    // Writing into a vector cannot fail, and none of our maps has an encoder that does.
+    // A write to a vector cannot fail, and no message has an encoder that fails.
     minicbor::to_vec(value).unwrap_or_default()
 }
 
-/// A value from its CBOR map; nothing may follow it.
+/// Decodes a value from its CBOR map; no bytes may follow it.
 pub(super) fn from_map<'b, T: Decode<'b, ()>>(kind: u8, map: &'b [u8]) -> Result<T, FrameError> {
     let malformed = |reason: String| FrameError::Malformed { kind, reason };
     let mut decoder = minicbor::Decoder::new(map);

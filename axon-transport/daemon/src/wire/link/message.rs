@@ -16,7 +16,7 @@ use minicbor::{Decode, Encode};
 use super::frame::{FrameError, from_map, to_map};
 use crate::{daemon_key::DaemonProof, owner::Proof, wire::keys::KeyMessage};
 
-/// Who a daemon is and how it is set up: the first message in each direction.
+/// The identity and the settings of a daemon: the first message in each direction.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct LinkHello {
@@ -59,25 +59,25 @@ pub struct LinkHello {
     /// The daemon that the dialler means to reach.
     #[n(16)]
     pub expects: Option<DaemonId>,
-    /// Whether the sender lists the receiver as a static peer.
+    /// True if the sender lists the receiver as a static peer.
     #[n(17)]
     pub static_peer: bool,
-    /// Routes that the sender serves a peer at most. Absent: 1,024.
+    /// Most routes that the sender serves a peer; absent: 1,024.
     #[n(18)]
     pub routes: Option<u32>,
-    /// Proves the sender's id for this connection. Versions before say none.
+    /// The proof of the sender's id for this connection. Earlier versions send none.
     #[n(19)]
     pub proof: Option<DaemonProof>,
 }
 
-/// The connection that the lower daemon id keeps.
+/// The connection that the daemon with the lower id keeps.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct Elected {
-    /// Names the link, for a successor's HELLO.
+    /// The name of the link, for a successor's HELLO.
     #[cbor(n(0), with = "minicbor::bytes")]
     pub link: [u8; 16],
-    /// Larger than that of any link elected before it: on two connections, what was said first may be
+    /// Larger than that of any link elected before it: of messages on two connections, the first that was sent may be
     /// read last.
     #[n(1)]
     pub election: u64,
@@ -87,12 +87,12 @@ pub struct Elected {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct LinkClosed {
-    /// Its name in ELECTED.
+    /// The name of the link in ELECTED.
     #[cbor(n(0), with = "minicbor::bytes")]
     pub link: [u8; 16],
 }
 
-/// What changed in the sender's graph.
+/// The changes of the sender's graph.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct GraphUpdate {
@@ -102,31 +102,31 @@ pub struct GraphUpdate {
     /// Version that it builds on; 0 for a whole graph.
     #[n(1)]
     pub before: u64,
-    /// Endpoints that came or changed.
+    /// New or changed endpoints.
     #[n(2)]
     pub added: Vec<Endpoint>,
-    /// Endpoints that went.
+    /// Removed endpoints.
     #[n(3)]
     pub removed: Vec<Gid>,
-    /// Whether the next GRAPH goes on with it: a whole graph counts once all of it is there.
+    /// True if the next GRAPH continues this one: a whole graph counts once all of it has arrived.
     #[n(4)]
     pub more: bool,
-    /// Those of `added` whose session's range is LOCALHOST; the others' is SUBNET.
+    /// Endpoints of `added` whose session's range is LOCALHOST; the range of the others is SUBNET.
     #[n(5)]
     pub localhost: Option<Vec<Gid>>,
-    /// Those of `added` whose session lists the receiver's host as a static peer.
+    /// Endpoints of `added` whose session lists the receiver's host as a static peer.
     #[n(6)]
     pub listing: Option<Vec<Gid>>,
-    /// Those of `added` that the receiver may see and not use: access rules of the sender deny it the other end.
+    /// Endpoints of `added` that the receiver may see and not use: access rules of the sender deny it the other end.
     #[n(7)]
     pub denied: Option<Vec<Gid>>,
 }
 
-/// The receiver of GRAPH missed a version and asks for the whole.
+/// A request for the whole graph by a receiver of GRAPH that missed a version.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct GraphResync {
-    /// The version it holds.
+    /// The version that the receiver holds.
     #[n(0)]
     pub version: u64,
 }
@@ -135,10 +135,10 @@ pub struct GraphResync {
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct RouteSubscriber {
-    /// Its GID.
+    /// The subscription's GID.
     #[n(0)]
     pub gid: Gid,
-    /// What it requests.
+    /// The requested QoS.
     #[n(1)]
     pub qos: Qos,
 }
@@ -150,12 +150,12 @@ pub struct LastSeen {
     /// The publisher.
     #[n(0)]
     pub publisher: Gid,
-    /// Its sequence number.
+    /// The sample's sequence number.
     #[n(1)]
     pub sequence: u64,
 }
 
-/// Asks for a topic's samples; again with the same route to change its subscriptions.
+/// A request for a topic's samples. The asking side repeats it with the same route to change its subscriptions.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct Subscribe {
@@ -174,26 +174,26 @@ pub struct Subscribe {
     /// The subscriptions that the route serves.
     #[n(4)]
     pub subscribers: Vec<RouteSubscriber>,
-    /// Where to resume.
+    /// The samples after which the route resumes.
     #[n(5)]
     pub last: Vec<LastSeen>,
-    /// Whether the asking side acknowledges with RECEIVED what it gets.
+    /// True if the asking side acknowledges received samples with RECEIVED.
     #[n(6)]
     pub acknowledges: Option<bool>,
-    /// Whether the asking side reads short headers.
+    /// True if the asking side reads short headers.
     #[n(7)]
     pub short_headers: Option<bool>,
 }
 
 impl Subscribe {
-    /// Bytes that count for it where memory is bounded.
+    /// Returns the bytes that it counts towards memory limits.
     pub fn bytes(&self) -> usize {
         let Self { topic, type_name, subscribers, last, .. } = self;
         topic.len() + type_name.len() + size_of_val(&**subscribers) + size_of_val(&**last)
     }
 }
 
-/// Ends a route.
+/// A request to end a route.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct Unsubscribe {
@@ -209,31 +209,31 @@ pub struct RouteReady {
     /// The route.
     #[n(0)]
     pub route: u32,
-    /// Their GIDs.
+    /// The publishers' GIDs.
     #[n(1)]
     pub publishers: Vec<Gid>,
 }
 
-/// Publishers of the sender's host that were alive since it was said last, whether or not they
-/// published: of those that have a lease and feed a route.
+/// Publishers of the sender's host that were alive since the last such message, whether or not they published. Only
+/// publishers that have a lease and feed a route are listed.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct LivelinessAsserted {
-    /// Their GIDs.
+    /// The publishers' GIDs.
     #[n(0)]
     pub publishers: Vec<Gid>,
 }
 
-/// How far the samples of publishers came: a message of one.
+/// The progress of publishers' samples, as the receiver reports it.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct ReceivedUpTo {
-    /// One element a publisher and route.
+    /// One element per publisher and route.
     #[n(0)]
     pub flows: Vec<ReceivedOf>,
 }
 
-/// How far the reliable samples of one publisher came over one route.
+/// The progress of one publisher's reliable samples over one route.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(array)]
 pub struct ReceivedOf {
@@ -246,28 +246,27 @@ pub struct ReceivedOf {
     /// Samples up to this number are in the ring from which subscriptions take.
     #[n(2)]
     pub sequence: u64,
-    /// But for so many, since it was said last, that the receiver had to drop.
+    /// The number of samples among them that the receiver had to drop since its last report.
     #[n(3)]
     pub dropped: u64,
 }
 
-/// A route is not served, though it was asked for.
+/// A route that is not served, although it was requested.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct RouteRefused {
     /// The asking side's number for the route.
     #[n(0)]
     pub route: u32,
-    /// Why, for people.
+    /// The reason, for people.
     #[n(1)]
     pub reason: String,
-    /// Seconds after which the route may be asked for again; absent: as long as nothing changes there
-    /// is no use.
+    /// Seconds after which the route may be requested again; absent: a request is useless until something changes.
     #[n(2)]
     pub retry_s: Option<u32>,
 }
 
-/// The sender does not ask for a route that both graphs call for, or for some of its publishers.
+/// A route that both graphs require and that the sender does not ask for, or not for all of its publishers.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct RouteUnasked {
@@ -280,31 +279,31 @@ pub struct RouteUnasked {
     /// 0 topic, 1 request, 2 response.
     #[n(2)]
     pub kind: u8,
-    /// Why, for people; absent: it asks for all after all, or has no use for it.
+    /// The reason, for people; absent: the sender asks for all of the route after all, or has no use for it.
     #[n(3)]
     pub reason: Option<String>,
 }
 
-/// What the sender of this message takes in over this link at a time.
+/// The limits of the bytes that the sender of this message accepts over this link at a time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct ReceiveLimits {
     /// Bytes that it has not read: the connection's window.
     #[n(0)]
     pub unread: u64,
-    /// Bytes of messages longer than 32 KiB that have not come whole or wait for a reader.
+    /// Bytes of messages longer than 32 KiB that are incomplete or wait for a reader.
     #[n(1)]
     pub messages: u64,
 }
 
-/// What the receiver may not do at the sender's host, of what the sender knows from the receiver's graph.
+/// Uses that the sender's host denies the receiver, as far as the sender knows them from the receiver's graph.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct DeniedUses {
-    /// What is denied now.
+    /// Uses that are denied now.
     #[n(0)]
     pub denied: Vec<DeniedUse>,
-    /// What was denied and is not any more, or is of no endpoint of the receiver any more. The reasons are empty.
+    /// Uses that are no longer denied, or that no endpoint of the receiver makes any more. The reasons are empty.
     #[n(1)]
     pub lifted: Vec<DeniedUse>,
 }
@@ -319,63 +318,63 @@ pub struct DeniedUse {
     /// Topic or service.
     #[n(1)]
     pub name: String,
-    /// Which rule decides, for people.
+    /// The rule that decides, for people.
     #[n(2)]
     pub reason: String,
 }
 
-/// Uses in one message, at most.
+/// Most uses in one message.
 pub const MAX_DENIED: usize = 512;
 
-/// The sender asks what access rules at the receiver's host let it do there.
+/// A question about the uses that access rules at the receiver's host permit to the sender.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct LinkAccessCheck {
     /// The sender's number for the question.
     #[n(0)]
     pub number: u64,
-    /// What it would do.
+    /// The uses in question.
     #[n(1)]
     pub uses: Vec<CheckedUse>,
 }
 
-/// Answers a [`LinkAccessCheck`].
+/// The answer to a [`LinkAccessCheck`].
 #[derive(Clone, Debug, Default, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct AccessDecisions {
     /// The number of the question.
     #[n(0)]
     pub number: u64,
-    /// One for each use, in the order of the question.
+    /// One decision for each use, in the order of the question.
     #[n(1)]
     pub decisions: Vec<UseDecision>,
 }
 
-/// What access rules say of one use.
+/// The decision of access rules about one use.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(array)]
 pub struct UseDecision {
-    /// Whether they allow it.
+    /// True if the rules allow the use.
     #[n(0)]
     pub allowed: bool,
-    /// Which rule decides, for people.
+    /// The rule that decides, for people.
     #[n(1)]
     pub reason: String,
 }
 
-/// That sessions are the sender's. Said before GRAPH, once on each connection.
+/// Proofs that sessions belong to the sender. Sent before GRAPH, once on each connection.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct Owners {
-    /// One for each session.
+    /// One proof for each session.
     #[n(0)]
     pub proofs: Vec<Proof>,
 }
 
-/// Proofs in one message.
+/// Most proofs in one message.
 pub const MAX_PROOFS: usize = 128;
 
-/// KEEPALIVE carries nothing.
+/// The empty content of KEEPALIVE.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 struct NoContent {}
@@ -388,48 +387,48 @@ const MAX_REASON: usize = 1024;
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum LinkMessage {
-    /// Who I am.
+    /// The identity and the settings of the sender.
     Hello(LinkHello),
-    /// This connection stays.
+    /// The election of this connection.
     Elected(Elected),
     /// Graph changes.
     Graph(GraphUpdate),
-    /// Send the whole graph.
+    /// A request for the whole graph.
     GraphResync(GraphResync),
-    /// Send a topic.
+    /// A request for a topic.
     Subscribe(Subscribe),
-    /// Stop sending it.
+    /// A request to end a route.
     Unsubscribe(Unsubscribe),
-    /// The topic's publishers are attached.
+    /// The publishers of a route that are attached.
     RouteReady(RouteReady),
-    /// Still here.
+    /// A sign of life.
     Keepalive,
-    /// These publishers, too.
+    /// Publishers that were alive.
     Asserted(LivelinessAsserted),
-    /// So far samples came.
+    /// The progress of received samples.
     Received(ReceivedUpTo),
-    /// This route is not served.
+    /// A route that is not served.
     RouteRefused(RouteRefused),
-    /// This route is not asked for.
+    /// A route that the sender does not ask for.
     RouteUnasked(RouteUnasked),
-    /// These sessions are mine.
+    /// Proofs that sessions belong to the sender.
     Owners(Owners),
-    /// A silent link that this one succeeds is closed.
+    /// The end of a silent link that this link succeeds.
     LinkClosed(LinkClosed),
-    /// How much the sender takes in at a time.
+    /// The limits of the bytes that the sender accepts at a time.
     ReceiveLimits(ReceiveLimits),
     /// Uses that the sender's access rules deny to the receiver.
     Denied(DeniedUses),
-    /// Asks whether the receiver's access rules allow uses.
+    /// A question whether the receiver's access rules allow uses.
     AccessCheck(LinkAccessCheck),
-    /// Answers ACCESS_CHECK.
+    /// The answer to ACCESS_CHECK.
     AccessDecisions(AccessDecisions),
-    /// About keys.
+    /// A message about keys.
     Keys(KeyMessage),
 }
 
 impl LinkMessage {
-    /// Type byte and CBOR map.
+    /// Returns the type byte and the CBOR map.
     pub(super) fn encode(&self) -> (u8, Vec<u8>) {
         match self {
             Self::Hello(m) => (1, to_map(m)),
@@ -458,12 +457,12 @@ impl LinkMessage {
         }
     }
 
-    /// Whether [`decode`](Self::decode) knows this type.
+    /// Returns whether [`decode`](Self::decode) knows this type.
     pub(super) fn is_known(kind: u8) -> bool {
         matches!(kind, 1..=22)
     }
 
-    /// The message of type `kind`, `None` for an unknown type.
+    /// Decodes the message of type `kind`; returns `None` for an unknown type.
     pub(super) fn decode(kind: u8, map: &[u8]) -> Result<Option<Self>, FrameError> {
         let message = match kind {
             1 => Self::Hello(from_map(kind, map)?),
@@ -496,7 +495,7 @@ impl LinkMessage {
         }
     }
 
-    /// What the CBOR types alone do not bound.
+    /// Checks the limits that the CBOR types alone do not set.
     fn bounds(&self) -> Result<(), &'static str> {
         let ok = |condition: bool, reason| if condition { Ok(()) } else { Err(reason) };
         match self {
@@ -564,7 +563,7 @@ impl LinkMessage {
             | Self::Keepalive
             | Self::ReceiveLimits(_)
             | Self::LinkClosed(_) => Ok(()),
-            // Their decoder bounds them.
+            // The decoder of key messages checks their limits.
             Self::Keys(_) => Ok(()),
         }
     }

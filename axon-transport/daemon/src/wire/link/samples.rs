@@ -43,7 +43,7 @@ pub(crate) fn elected() -> LinkMessage {
     LinkMessage::Elected(Elected { link: [9; 16], election: 3 })
 }
 
-/// HELLO first.
+/// Returns example messages, HELLO first.
 pub(crate) fn messages() -> Vec<LinkMessage> {
     let qos = Qos::keep_all().with_lifespan(std::time::Duration::from_nanos(7));
     vec![

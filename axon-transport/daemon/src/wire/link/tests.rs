@@ -44,7 +44,7 @@ fn unknown_types_and_keys_are_skipped() {
 
 #[test]
 fn an_unknown_type_is_skipped_without_decompression() {
-    // No zstd frame, and of a length that no map may have.
+    // Not a zstd frame, and of a length that no map may have.
     for length in [16, u32::MAX] {
         let frame = [&[0xff][..], &length.to_be_bytes(), b"no zstd frame"].concat();
         assert_eq!(decode(&frame).unwrap(), None);

@@ -134,7 +134,7 @@ fn a_journal_that_its_session_corrupts_costs_a_look_at_its_rings_alone() {
 }
 
 #[test]
-fn a_session_that_numbers_all_of_its_rings_alike_has_each_of_them_looked_at_once() {
+fn rings_of_one_number_are_each_checked_once() {
     let (of, from) = (session(), session());
     from.follow();
     let number = |writer: &Writer| writer.header.words()[layout::ring::NUMBER].store(7, Relaxed);
@@ -151,7 +151,7 @@ fn a_session_that_numbers_all_of_its_rings_alike_has_each_of_them_looked_at_once
 }
 
 #[test]
-fn a_sample_that_was_not_noted_is_found_when_its_publisher_is_seen_to_end() {
+fn sample_missing_in_the_journal_is_found_at_the_end_of_its_publisher() {
     let (of, from) = (session(), session());
     from.follow();
     let topics = topics(&of, &from, 1..101, true);

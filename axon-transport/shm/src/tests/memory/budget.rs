@@ -98,7 +98,7 @@ fn a_ring_that_may_have_no_more_memory_shows_its_newest_sample() {
 }
 
 #[test]
-fn a_ring_that_its_readers_hold_is_held_back_and_goes_on_when_they_take() {
+fn ring_without_memory_waits_for_its_keep_all_readers() {
     let (a, b) = (session(), session());
     let budget = MemoryBudget::new(MOST);
     let writer = ring(&a, 1, Qos::keep_all(), &budget);

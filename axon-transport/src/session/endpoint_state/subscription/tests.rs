@@ -112,7 +112,7 @@ fn a_server_takes_each_request_once_in_order_however_many_daemons_bring_it() {
 }
 
 #[test]
-fn a_request_that_there_is_no_memory_for_is_not_overtaken_by_later_ones_of_its_client() {
+fn request_without_memory_holds_up_later_ones_of_its_client() {
     let mut of = Served::new();
     of.daemon([1, 2]);
     of.daemon([1, 2, 3]);

@@ -1,4 +1,4 @@
-//! A link whose peer did not prove its id keeps nobody from being dialled who may have the id.
+//! Tests that a link whose peer did not prove its id does not prevent dials to other hosts that may have the id.
 
 use super::*;
 use crate::wire::beacon::Datagram;
@@ -6,7 +6,8 @@ use crate::wire::beacon::Datagram;
 const OWNER: &str = "10.0.0.2:61301";
 const OTHER: &str = "10.0.0.9:61301";
 
-/// The peer's beacon comes, and it answers the probe that follows, if one does.
+/// Delivers the peer's beacon, and the peer's answer to the probe that follows, if there is one. Returns the dialled
+/// daemons.
 fn hear_and_answer(peers: &mut PeerDiscovery, now: f64) -> Vec<DaemonId> {
     hear(peers, now, beacon(HIGHER));
     let mut dialled = Vec::new();
@@ -35,7 +36,7 @@ fn the_owner_is_dialled_where_it_answers_until_it_is_linked() {
     peers.handle_link_up(secs(3.0), HIGHER, from(OTHER), false);
     assert_eq!(dials(&mut peers), []);
     assert_eq!(hear_and_answer(&mut peers, 4.0), [HIGHER]);
-    // A dial that fails is repeated, seldom: it may be an older daemon with two addresses.
+    // A failed dial is repeated, at long intervals: the other host may be an older daemon with two addresses.
     for standing in AddressConfidence::ALL {
         peers.handle_dial_failed(secs(4.1), HIGHER, standing);
     }
@@ -76,7 +77,7 @@ fn a_peer_of_an_older_version_is_not_dialled_where_it_was_found() {
     assert_eq!(dials(&mut peers), [HIGHER]);
     peers.handle_link_up(secs(3.1), HIGHER, from(OWNER), false);
     assert_eq!(hear_and_answer(&mut peers, 4.0), []);
-    // Nor at its second address, once it was found there.
+    // The peer is not dialled at its second address either, once it was found there.
     let elsewhere = Datagram::Beacon(beacon(HIGHER)).encode();
     let second = from("10.0.0.3:61301");
     peers.set_listed(secs(4.0), vec![(second.ip(), None)]);
@@ -97,7 +98,7 @@ fn a_host_that_is_only_heard_of_is_not_dialled_while_a_link_stands() {
     peers.handle_link_up(secs(3.0), HIGHER, from(OTHER), false);
     actions(&mut peers);
     for now in 4..100 {
-        // Beacons are easily forged: nobody answers there.
+        // Beacons are easily forged: no daemon answers there.
         hear(&mut peers, now.into(), beacon(HIGHER));
         peers.handle_timeout(secs(now.into()));
         assert_eq!(dials(&mut peers), []);

@@ -3,16 +3,16 @@
 use super::*;
 use crate::wire::beacon::{Beacon, Datagram};
 
-/// When the honest host starts; the forger began before it.
+/// The start of the honest host, in milliseconds; the forger began before it.
 const STARTS: u64 = 1_000;
 /// The first beacons of a daemon, in milliseconds from its start.
 const BURST: [u64; 5] = [0, 180, 450, 900, 1_700];
-/// How long the two may take.
+/// The most time until the dial, in milliseconds.
 const LIMIT: u64 = 3_000;
-/// How long an answer of the honest host is on its way, in milliseconds.
+/// The time that an answer of the honest host takes, in milliseconds.
 const ROUND_TRIP: u64 = 20;
 
-/// What the forger sends in a millisecond: from where, and what.
+/// A forger: returns its datagrams of a millisecond, each with its source.
 type Forger = fn(u64) -> Vec<(SocketAddr, Arrival, Datagram)>;
 
 /// An honest host at its address, and a forger.
@@ -22,12 +22,12 @@ struct Scene {
     address: SocketAddr,
     arrival: Arrival,
     forger: Forger,
-    /// When the honest host starts, in milliseconds.
+    /// The start of the honest host, in milliseconds.
     starts: u64,
     now: u64,
-    /// Answers of the honest host that are on their way, and when they are here.
+    /// Answers of the honest host that are in flight, each with the time of its arrival.
     echoes: VecDeque<(u64, Vec<u8>)>,
-    /// Probes that it heard.
+    /// The number of probes that the honest host received.
     probes: usize,
 }
 
@@ -47,7 +47,7 @@ impl Scene {
         }
     }
 
-    /// This host lists the other one, which lists it too.
+    /// Creates a scene in which this host and the honest host list each other.
     fn listed(honest: DaemonId, forger: Forger) -> Self {
         let mut scene = Self::new(honest, forger);
         scene.peers.set_listed(secs(3.0), vec![(scene.address.ip(), None)]);
@@ -55,7 +55,7 @@ impl Scene {
         scene
     }
 
-    /// The two had a link, which is lost when the forger begins.
+    /// Creates a scene in which the two hosts had a link, which is lost when the forger begins.
     fn met(honest: DaemonId, forger: Forger) -> Self {
         let mut scene = Self::new(honest, forger);
         scene.honest_speaks();
@@ -78,7 +78,7 @@ impl Scene {
         self.peers.handle_datagram(self.time(), source, self.arrival, &bytes);
     }
 
-    /// Milliseconds from the honest host's start until this host dials it where it is.
+    /// Returns the milliseconds from the honest host's start until this host dials its true address.
     fn play(&mut self) -> Option<u64> {
         let begin = self.now;
         for passed in 0..self.starts + 2 * LIMIT {
@@ -99,7 +99,8 @@ impl Scene {
         None
     }
 
-    /// Does what the state machine wants; only the honest host answers. Whether that was dialled.
+    /// Performs the outputs of the state machine; only the honest host answers. Returns whether the honest host was
+    /// dialled.
     fn is_dialled(&mut self) -> bool {
         let mut dialled = false;
         while self.echoes.front().is_some_and(|(at, _)| *at <= self.now) {
@@ -109,7 +110,7 @@ impl Scene {
         while let Some(output) = self.peers.poll_output() {
             match output {
                 PeersOutput::Action(DiscoveryAction::Dial { daemon, addrs, .. }) => {
-                    // An address that does not answer takes 5 s; the first is what counts.
+                    // An address that does not answer takes 5 s, so only the first address counts.
                     dialled |= daemon == self.honest && addrs[0] == self.address;
                 }
                 PeersOutput::Action(DiscoveryAction::SendFromQuicPort { to, bytes })
@@ -137,16 +138,16 @@ impl Scene {
     }
 
     fn bounded(&self) {
-        // One was linked.
+        // One of the records was linked.
         assert!(self.peers.records.len() <= MOST_UNAUTHENTICATED + 1);
         assert!(self.peers.in_flight() <= MOST_IN_FLIGHT);
     }
 
-    /// The flood is over: nothing of it stays.
+    /// Ends the flood, and checks that nothing of it stays.
     fn ends(&mut self) {
         for second in 1..=300 {
             self.now += 1_000;
-            // The honest host goes on.
+            // The honest host continues.
             if second % 10 == 0 {
                 self.honest_speaks();
             }
@@ -158,13 +159,13 @@ impl Scene {
 }
 
 fn made_up(number: u64) -> DaemonId {
-    // Above and below this host's own.
+    // The ids are above and below this host's own.
     let mut id = [if number.is_multiple_of(2) { 0x11 } else { 0xee }; 16];
     id[1..9].copy_from_slice(&number.to_be_bytes());
     DaemonId(id)
 }
 
-/// An address of this subnet's where nobody is.
+/// Returns an unused address of this subnet.
 fn forged(number: u64) -> SocketAddr {
     SocketAddr::from(([10, 0, 0, 10 + (number % 240) as u8], 10_000 + (number / 7 % 50_000) as u16))
 }
@@ -174,27 +175,27 @@ fn said(source: SocketAddr, daemon: DaemonId) -> (SocketAddr, Arrival, Datagram)
     (source, Arrival::Quic, Datagram::Beacon(beacon))
 }
 
-/// 300 a second, each of another daemon at another address.
+/// Forges 300 beacons a second, each of another daemon at another address.
 fn from_everywhere(ms: u64) -> Vec<(SocketAddr, Arrival, Datagram)> {
     let numbers = (ms * 3 / 10)..((ms + 1) * 3 / 10);
     numbers.map(|number| said(forged(number), made_up(number))).collect()
 }
 
-/// The same from one address.
+/// Forges 300 beacons a second, each of another daemon, from one address.
 fn from_one_address(ms: u64) -> Vec<(SocketAddr, Arrival, Datagram)> {
     let numbers = (ms * 3 / 10)..((ms + 1) * 3 / 10);
     let at = |number| SocketAddr::from(([10, 0, 0, 66], 10_000 + (number % 50_000) as u16));
     numbers.map(|number| said(at(number), made_up(number))).collect()
 }
 
-/// The same, as if from the honest host's address.
+/// Forges 300 beacons a second, each of another daemon, from the honest host's address.
 fn from_the_honest_address(ms: u64) -> Vec<(SocketAddr, Arrival, Datagram)> {
     let numbers = (ms * 3 / 10)..((ms + 1) * 3 / 10);
     let at = |number| SocketAddr::from(([10, 0, 0, 2], 10_000 + (number % 50_000) as u16));
     numbers.map(|number| said(at(number), made_up(number))).collect()
 }
 
-/// The same, as if from all ports that a daemon there would have.
+/// Forges the same beacons from all ports that a daemon at the honest host's address would have.
 fn from_the_expected_ports(ms: u64) -> Vec<(SocketAddr, Arrival, Datagram)> {
     let mut all = from_the_honest_address(ms);
     for (number, (source, _, datagram)) in all.iter_mut().enumerate() {
@@ -206,14 +207,14 @@ fn from_the_expected_ports(ms: u64) -> Vec<(SocketAddr, Arrival, Datagram)> {
     all
 }
 
-/// 20 a second under the ids of the hosts that these tests know.
+/// Forges 20 beacons a second under the ids of the hosts that these tests know.
 fn under_the_id(ms: u64) -> Vec<(SocketAddr, Arrival, Datagram)> {
     let number = ms / 50;
     let ids = if ms.is_multiple_of(50) { &[LOWER, HIGHER][..] } else { &[] };
     ids.iter().map(|id| said(forged(number), *id)).collect()
 }
 
-/// The same at the honest host's address, with ports that are wrong.
+/// Forges the same beacons at the honest host's address, with wrong ports.
 fn under_the_id_with_wrong_ports(ms: u64) -> Vec<(SocketAddr, Arrival, Datagram)> {
     let mut all = under_the_id(ms);
     for (source, ..) in &mut all {
@@ -222,8 +223,7 @@ fn under_the_id_with_wrong_ports(ms: u64) -> Vec<(SocketAddr, Arrival, Datagram)
     all
 }
 
-/// 20 goodbyes a second in the names of the hosts that these tests know, from the honest host's
-/// address.
+/// Forges 20 goodbyes a second in the names of the hosts that these tests know, from the honest host's address.
 fn goodbyes(ms: u64) -> Vec<(SocketAddr, Arrival, Datagram)> {
     let ids = if ms.is_multiple_of(50) { &[LOWER, HIGHER][..] } else { &[] };
     let goodbye = |daemon: &DaemonId| Datagram::Goodbye { domain: 0, daemon: *daemon };
@@ -231,14 +231,14 @@ fn goodbyes(ms: u64) -> Vec<(SocketAddr, Arrival, Datagram)> {
     ids.iter().map(|id| (at, Arrival::Shared, goodbye(id))).collect()
 }
 
-/// Goodbyes, and beacons under the same ids from elsewhere.
+/// Forges goodbyes, and beacons under the same ids from other addresses.
 fn goodbyes_and_beacons(ms: u64) -> Vec<(SocketAddr, Arrival, Datagram)> {
     let mut all = goodbyes(ms);
     all.extend(under_the_id(ms + 17));
     all
 }
 
-/// All of it, and goodbyes under the same ids from the addresses that were forged.
+/// Forges all of these, and goodbyes under the same ids from the forged addresses.
 fn everything(ms: u64) -> Vec<(SocketAddr, Arrival, Datagram)> {
     let mut all = from_everywhere(ms);
     all.extend(from_one_address(ms));
@@ -281,7 +281,7 @@ fn a_host_that_was_linked_is_dialled_again_through_any_flood() {
             (everything, "met, everything"),
         ] {
             let mut scene = Scene::met(honest, forger);
-            // While it was linked beacons said other things of it.
+            // While the host was linked, beacons contradicted it.
             for ms in 0..1_000 {
                 scene.now += 1;
                 for (source, arrival, datagram) in forger(ms) {
@@ -309,7 +309,7 @@ fn an_unknown_host_is_dialled_through_any_flood_once_it_answers() {
 
 #[test]
 fn an_answer_is_asked_of_no_flood() {
-    // A listed host that asks who is there is answered while others ask without end.
+    // A listed host that asks for an answer gets it while other hosts ask without end.
     let mut scene = Scene::listed(HIGHER, from_everywhere);
     for ms in 0..5_000 {
         scene.now += 1;
@@ -329,11 +329,11 @@ fn an_answer_is_asked_of_no_flood() {
         _ => false,
     });
     assert!(answered);
-    // Its own beacons go as often as without the flood.
+    // This daemon's own beacons are sent as often as without the flood.
     assert!(scene.peers.interval() <= secs(20.0), "{:?}", scene.peers.interval());
 }
 
-/// Probes that were sent since the last look, by host.
+/// Returns the number of probes since the last call, by host.
 fn probed(peers: &mut PeerDiscovery) -> BTreeMap<IpAddr, usize> {
     let mut hosts = BTreeMap::new();
     while let Some(output) = peers.poll_output() {
@@ -346,7 +346,7 @@ fn probed(peers: &mut PeerDiscovery) -> BTreeMap<IpAddr, usize> {
     hosts
 }
 
-/// Most probes that one host hears within ten seconds of what its forger does, four times a millisecond.
+/// Returns the most probes that one host receives within ten seconds of the forger's datagrams, at four times its rate.
 fn most_probed(mut scene: Scene) -> usize {
     for ms in 0..10_000 {
         scene.now += 1;
@@ -362,16 +362,16 @@ fn most_probed(mut scene: Scene) -> usize {
 
 #[test]
 fn a_host_in_whose_name_beacons_are_forged_hears_few_probes() {
-    // 32 within each of the four times that answers are awaited.
+    // At most 32 in each of the four periods for answers.
     const OTHERS: usize = 4 * 32;
     let most = most_probed(Scene::new(HIGHER, from_one_address));
     assert!((1..=OTHERS).contains(&most), "{most}");
     let most = most_probed(Scene::listed(HIGHER, from_the_honest_address));
     assert!((1..=OTHERS).contains(&most), "{most}");
-    // Of a host that is known each of the sixteen ports is asked four times a second.
+    // At a known host each of the sixteen ports is probed four times a second.
     let most = most_probed(Scene::listed(HIGHER, from_the_expected_ports));
     assert!((1..=OTHERS + 16 * 41).contains(&most), "{most}");
-    // As often a port where somebody answers.
+    // A port with a daemon that answers is probed as often.
     let mut scene = Scene::listed(HIGHER, from_the_expected_ports);
     for ms in 0..10_000 {
         scene.now += 1;
@@ -420,7 +420,7 @@ fn no_more_beacons_of_strangers_are_looked_at_than_a_second_has_time_for() {
 #[test]
 fn a_flood_pushes_out_no_host_that_answered() {
     let mut scene = Scene::new(HIGHER, from_the_honest_address);
-    // Its dials fail, so that nothing but its answer speaks for it.
+    // Dials to the host fail, so that only its answer shows that it is there.
     scene.honest_speaks();
     let source = scene.address;
     let record = scene.peers.records.get_mut(&HIGHER).unwrap();

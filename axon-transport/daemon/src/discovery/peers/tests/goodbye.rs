@@ -1,10 +1,10 @@
-//! Handles goodbyes, from daemons that end and from forgers.
+//! Tests goodbyes, from daemons that end and from forgers.
 
 use super::*;
 use crate::wire::beacon::{Beacon, Datagram};
 
 #[test]
-fn a_goodbye_counts_once_the_link_is_down_and_only_from_where_the_peer_is() {
+fn goodbye_counts_after_the_link_ended_and_from_the_address_of_the_peer_alone() {
     let goodbye = Datagram::Goodbye { domain: 0, daemon: HIGHER }.encode();
     let mut peers = settled(local());
     hear(&mut peers, 3.0, beacon(HIGHER));
@@ -12,7 +12,7 @@ fn a_goodbye_counts_once_the_link_is_down_and_only_from_where_the_peer_is() {
     actions(&mut peers);
     peers.handle_datagram(secs(4.0), from("10.0.0.2:4000"), Arrival::Shared, &goodbye);
     peers.handle_link_down(secs(4.1), HIGHER);
-    // Anybody could have said it: it is asked, and not dialled meanwhile.
+    // Any host could have sent the goodbye: the peer is probed, and not dialled meanwhile.
     assert_eq!(probes(&mut peers).len(), 1);
     peers.handle_timeout(secs(7.0));
     assert_eq!(actions(&mut peers), []);
@@ -48,7 +48,7 @@ fn a_peer_that_answers_after_a_goodbye_in_its_name_stays() {
     peers.handle_datagram(secs(4.2), address, Arrival::Quic, &echo);
     assert_eq!(dials(&mut peers), [HIGHER]);
     fail(&mut peers, secs(4.3), HIGHER);
-    // More of them say nothing for a while, so that they cost nothing either.
+    // Further goodbyes have no effect for a while, so that they cost nothing either.
     for _ in 0..100 {
         peers.handle_datagram(secs(4.4), from("10.0.0.2:4000"), Arrival::Shared, &goodbye);
     }
@@ -56,7 +56,8 @@ fn a_peer_that_answers_after_a_goodbye_in_its_name_stays() {
     assert_eq!(dials(&mut peers), [HIGHER], "and it alone");
 }
 
-/// Two addresses claim a daemon's id, neither of which could be dialled; then the first says goodbye.
+/// Returns discovery in which two addresses claim a daemon's id, neither of which could be dialled, and then the first
+/// says goodbye.
 fn contested(now: f64) -> PeerDiscovery {
     let mut peers = settled(local());
     hear(&mut peers, now, beacon(HIGHER));
@@ -96,7 +97,7 @@ fn an_address_of_several_that_does_not_answer_after_a_goodbye_is_forgotten_alone
     assert_eq!(left, [from("10.0.0.66:61301")]);
 }
 
-/// The probes that are to be sent, with their nonces; nothing else is.
+/// Returns the probes that are to be sent, with their nonces, and checks that there are no other actions.
 fn probes(peers: &mut PeerDiscovery) -> Vec<(SocketAddr, [u8; 8])> {
     let sent = actions(peers).into_iter().map(|action| match action {
         DiscoveryAction::SendFromQuicPort { to, bytes } => match Datagram::decode(&bytes) {

@@ -45,7 +45,7 @@ fn in_qkd() -> LocalDaemon {
     LocalDaemon { terms: QKD, sae: Some(("sae-a".to_owned(), peers)), ..local() }
 }
 
-/// Past its first beacons, so that what it says next is about its peers.
+/// Returns discovery after its first beacons, so that its next outputs concern its peers.
 pub(super) fn settled(local: LocalDaemon) -> PeerDiscovery {
     let mut peers = PeerDiscovery::new(local, 1);
     let interface = Interface {
@@ -59,7 +59,7 @@ pub(super) fn settled(local: LocalDaemon) -> PeerDiscovery {
     peers.set_interfaces(Duration::ZERO, vec![interface]);
     peers.set_port(Duration::ZERO, 61300);
     for _ in 0..5 {
-        // A daemon that looks for nobody sends no beacons and rests at once.
+        // A daemon that looks for no peers sends no beacons, so it has no timer.
         let Some(at) = peers.poll_timeout() else { break };
         assert!(at <= secs(2.0));
         peers.handle_timeout(at);
@@ -109,7 +109,7 @@ pub(super) fn hear(peers: &mut PeerDiscovery, now: f64, beacon: Beacon) {
     peers.handle_datagram(secs(now), from("10.0.0.2:4000"), Arrival::Shared, &bytes);
 }
 
-/// Whatever dial to the peer is under way fails.
+/// Fails all dials to the peer that are in flight.
 pub(super) fn fail(peers: &mut PeerDiscovery, now: Duration, daemon: DaemonId) {
     AddressConfidence::ALL
         .into_iter()
@@ -179,7 +179,7 @@ fn qkd_peers_must_be_listed_and_other_than_we() {
     let expected = [("AXON_SAE_ID", "sae-a"), ("AXON_QKD_PEERS", "sae-x")];
     assert_eq!(told, expected.map(|(setting, theirs)| (setting, theirs.to_owned())));
 
-    // SAE IDs decide who dials first: sae-a is below sae-b whatever their daemons' ids.
+    // SAE IDs decide which side dials first: sae-a is below sae-b whatever their daemons' ids.
     hear(&mut peers, 4.0, qkd(DaemonId([2; 16]), "sae-b"));
     match &actions(&mut peers)[..] {
         [DiscoveryAction::Dial { sae: Some(sae), .. }] => assert_eq!(sae, "sae-b"),
@@ -234,13 +234,13 @@ fn the_lower_id_dials_at_once_the_other_after_a_start() {
     peers.handle_timeout(secs(3.3));
     assert_eq!(dials(&mut peers), [LOWER]);
 
-    // A listed peer may be behind a NAT that lets only us begin.
+    // A listed peer may be behind a NAT that only lets this host begin.
     let mut peers = settled(local());
     peers.set_listed(secs(3.0), vec![("10.0.0.2".parse().unwrap(), None)]);
     hear(&mut peers, 3.0, beacon(LOWER));
     assert_eq!(dials(&mut peers), [LOWER]);
 
-    // Linked by its dial in the meantime.
+    // The peer's own dial made the link meanwhile.
     let mut peers = settled(local());
     hear(&mut peers, 3.0, beacon(LOWER));
     peers.handle_link_up(secs(3.2), LOWER, from("10.0.0.2:61301"), true);
@@ -260,7 +260,7 @@ fn failed_dials_back_off_up_to_eight_seconds() {
         let failed = now;
         loop {
             now = peers.poll_timeout().unwrap();
-            // It goes on saying that it is there.
+            // The peer continues to send beacons.
             hear(&mut peers, now.as_secs_f64(), beacon(HIGHER));
             peers.handle_timeout(now);
             if dials(&mut peers) == [HIGHER] {
@@ -275,7 +275,7 @@ fn failed_dials_back_off_up_to_eight_seconds() {
     fail(&mut peers, now, HIGHER);
     peers.set_interfaces(now + secs(1.0), Vec::new());
     assert_eq!(dials(&mut peers), [HIGHER], "another interface is another chance");
-    // An outcome that nobody reports is a failure in the end.
+    // A dial without a reported outcome counts as failed in the end.
     let lost = now + secs(31.0);
     hear(&mut peers, lost.as_secs_f64(), beacon(HIGHER));
     peers.handle_timeout(lost);
@@ -378,7 +378,7 @@ fn a_range_that_changes_is_followed() {
     assert_eq!(dials(&mut peers), [HIGHER]);
     peers.handle_link_up(secs(3.0), HIGHER, from("10.0.0.2:61301"), true);
 
-    // A link stays; once it is down it is not made again for nobody.
+    // A link stays; once it is down, it is not made again without a wish of the peer.
     peers.set_range(secs(4.0), Localhost);
     assert_eq!(multicasts(&mut peers, 30.0), 0);
     peers.handle_link_down(secs(31.0), HIGHER);

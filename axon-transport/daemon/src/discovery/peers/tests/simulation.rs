@@ -38,9 +38,9 @@ enum What {
 struct Subnet {
     now: Duration,
     hosts: Vec<Host>,
-    /// When each host wants to be woken.
+    /// The time at which each host wants to be woken.
     wakeups: Vec<Option<Duration>>,
-    /// By time, then by a running number.
+    /// The coming events, by time, then by a running number.
     coming: BTreeMap<(Duration, u64), What>,
     number: u64,
     random: StdRng,
@@ -113,7 +113,7 @@ impl Subnet {
         self.coming.insert((self.now + wait, self.number), what);
     }
 
-    /// The network: loses, delays, reorders, and at times sends twice.
+    /// Simulates the network: it loses, delays, reorders, and at times duplicates a datagram.
     fn transmit(&mut self, from: usize, to: usize, arrival: Arrival, bytes: &[u8]) {
         let copies = if self.random.random_bool(0.05) { 2 } else { 1 };
         for _ in 0..copies {
@@ -129,7 +129,7 @@ impl Subnet {
         }
     }
 
-    /// Lets a host do all it wants at this moment.
+    /// Performs all outputs of a host at this moment.
     fn settle(&mut self, host: usize) {
         self.hosts[host].peers.handle_timeout(self.now);
         while let Some(output) = self.hosts[host].peers.poll_output() {
@@ -158,7 +158,7 @@ impl Subnet {
                     let spaced = last.is_none_or(|last| last + Duration::from_secs(1) <= self.now);
                     assert!(spaced, "{host} dialled {to} at {last:?} and again at {:?}", self.now);
                     assert!(self.hosts[host].in_flight.insert(to), "dialled twice at once");
-                    // A dial whose peer linked by its own no longer counts.
+                    // A dial to a peer whose own dial made the link no longer counts.
                     let Host { in_flight, links, .. } = &self.hosts[host];
                     assert!(in_flight.difference(links).count() <= MOST_IN_FLIGHT);
                     let wait = Duration::from_millis(self.random.random_range(5..200));
@@ -170,7 +170,7 @@ impl Subnet {
                 PeersOutput::Action(DiscoveryAction::Named(names)) => {
                     panic!("it looks no names up: {names:?}")
                 }
-                // So many beacons were lost in a row that it seemed gone; it is told of anew.
+                // Many consecutive beacons were lost, so the peer seemed gone; its mismatch is reported again.
                 PeersOutput::Action(DiscoveryAction::Gone { daemon }) => {
                     let gone = self.hosts.iter().position(|h| h.peers.local.daemon == daemon);
                     assert!(!self.hosts[host].links.contains(&gone.unwrap()), "it is linked");
@@ -232,7 +232,7 @@ impl Subnet {
         }
     }
 
-    /// Those of the same terms are linked, and the others know why they are not.
+    /// Checks that hosts with the same terms are linked, and that the others know the reason why they are not.
     fn assert_whole(&self) {
         for (a, host) in self.hosts.iter().enumerate() {
             let differ = |b: &usize| self.hosts[*b].terms != host.terms;

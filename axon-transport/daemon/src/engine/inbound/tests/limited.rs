@@ -85,7 +85,7 @@ fn samples_that_were_dropped_and_come_again_are_not_delivered_and_counted_once()
 }
 
 #[test]
-fn the_stream_of_a_keep_all_topic_is_read_on_when_its_sample_may_pass() {
+fn limited_keep_all_stream_is_read_on_when_its_sample_may_pass() {
     let mut way = way("hold", 1000);
     way.inbound.routes().get_mut(&ROUTE).unwrap().keeps_all = true;
     for number in 1..=2 {

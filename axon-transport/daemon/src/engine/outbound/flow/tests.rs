@@ -117,7 +117,7 @@ fn keep_last_that_is_behind_copies_only_samples_that_it_sends() {
 }
 
 #[test]
-fn keep_last_that_is_behind_leaves_long_samples_in_the_ring_until_they_are_sent() {
+fn slow_keep_last_flow_leaves_long_samples_in_the_ring() {
     let mut way = behind(10);
     assert_eq!(way.fill(at(600)), 1);
     assert_eq!(way.fill(at(601)), 0, "one waits");
@@ -171,7 +171,7 @@ fn best_effort_that_is_behind_looks_at_no_more_than_its_depth() {
 }
 
 #[test]
-fn samples_of_which_the_queue_keeps_a_few_are_taken_a_few_at_a_time() {
+fn flow_takes_no_more_samples_than_its_queue_keeps() {
     // A sample that waits holds the memory of all that were taken with it.
     for (qos, sent_before) in [(keep_last(3), true), (Qos::sensor_data().with_depth(3), false)] {
         let mut way = Way::new(qos);

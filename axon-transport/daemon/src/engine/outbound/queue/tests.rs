@@ -85,7 +85,7 @@ fn keep_all_refuses_beyond_its_bytes_and_takes_one_sample_of_any_length() {
 }
 
 #[test]
-fn a_long_sample_leaves_before_the_one_before_it_is_acknowledged_and_a_third_waits() {
+fn two_long_samples_are_in_flight_and_a_third_waits() {
     for qos in [Qos::keep_all(), keep_last(1)] {
         // 1 MiB a flow, 8 MiB towards one peer.
         let budget = Budget::new(32 * MIB);
@@ -179,7 +179,7 @@ fn a_best_effort_queue_keeps_its_depth_and_drops_late_samples() {
 }
 
 #[test]
-fn a_best_effort_sample_with_a_lifespan_is_late_at_its_end_and_not_before() {
+fn best_effort_sample_expires_at_the_end_of_its_lifespan() {
     let budget = Budget::new(256 * MIB);
     let mut queue = Queue::new(&Qos::sensor_data().with_depth(3), budget.of_peer());
     for sequence in 1..=3 {

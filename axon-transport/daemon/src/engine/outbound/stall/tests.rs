@@ -48,7 +48,7 @@ fn stalled(why: StallCause) -> StallReport {
 }
 
 #[test]
-fn a_peer_that_lets_bytes_pass_and_takes_none_of_few_samples_is_too_slow() {
+fn peer_that_acknowledges_bytes_but_no_sample_is_stalled() {
     let busy = |now: Duration| {
         let parts = now.as_secs() / 9;
         vec![BusyFlow { progress: (0, parts), keeps: Some(30), ..held(now) }]
@@ -117,7 +117,7 @@ fn a_peer_that_sends_something_now_and_then_holds_no_publisher_up_for_long() {
 }
 
 #[test]
-fn a_host_that_is_switched_off_holds_a_publisher_up_until_it_is_gone_and_the_limit_is_over() {
+fn switched_off_host_holds_up_a_publisher_for_the_stall_limit() {
     let (at, found) = look(false, |now| vec![held(now)], |_| 0).expect("it is found");
     assert_eq!(found, stalled(StallCause::NothingRead));
     assert!(at >= GONE && at <= GONE + LIMIT, "{at:?}");
@@ -136,7 +136,7 @@ fn waiting_for_other_flows_excuses_no_flow_while_the_peer_is_gone() {
 }
 
 #[test]
-fn a_peer_that_holds_a_publisher_up_takes_its_share_or_is_found_too_slow() {
+fn peer_that_holds_up_a_publisher_takes_its_share_or_counts_as_stalled() {
     let period = LIMIT * PERIOD;
     let taking = |every: u64, keeps: u64| {
         move |now: Duration| {

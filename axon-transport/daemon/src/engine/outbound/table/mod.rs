@@ -351,7 +351,7 @@ mod tests {
     }
 
     #[test]
-    fn samples_that_did_not_leave_are_lost_with_the_link_unless_the_publisher_counts_them() {
+    fn unsent_samples_end_with_the_link_unless_the_publisher_keeps_them() {
         for (qos, lost) in [(Qos::sensor_data(), 2), (Qos::keep_all(), 0)] {
             let mut of = Fixture::new(qos);
             let flow = of.flow(11);

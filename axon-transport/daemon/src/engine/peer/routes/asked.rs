@@ -22,7 +22,7 @@ use crate::{
     link::{LastSeen, LinkMessage, Subscribe},
 };
 
-/// The peer is asked for a route once the local readers are attached, or after this time.
+/// Longest wait for local readers to attach before the peer is asked for a route.
 const ATTACH_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// A route that this host asked for.
@@ -31,12 +31,12 @@ pub(in crate::engine::peer) struct AskedRoute {
     pub(in crate::engine::peer) route: Route,
     /// The readers and writers that it was last asked for.
     pub(in crate::engine::peer) wanted: WantedRoute,
-    /// Whether a writer of it is not shown.
+    /// True if a writer of it is not shown.
     pub(in crate::engine::peer) incomplete: bool,
     pub(in crate::engine::peer) stand_ins: HashMap<Gid, Rc<StandIn>>,
-    /// One for each stand-in, of what the route may show of the peer's identity.
+    /// Charge of one per stand-in, on the limit of writers that the route may show of the peer's identity.
     pub(in crate::engine::peer) places: Charge,
-    /// One for each stand-in and each writer here that it may read.
+    /// Charge of one per stand-in and each writer here that it may read.
     pub(in crate::engine::peer) lanes: Charge,
     pub(in crate::engine::peer) room: Rc<Meter>,
 }
@@ -48,12 +48,12 @@ struct PendingAttachment {
     awaited: Vec<(Rc<StandIn>, usize)>,
 }
 
-/// Stand-ins whose local readers are attached, and the routes that the peer is asked for since theirs all are.
+/// Stand-ins whose local readers are attached, and the routes to ask for because all their readers are attached.
 #[derive(Default)]
 pub(in crate::engine::peer) struct Attached {
     /// Stand-ins that samples may be written to, by the number of their route.
     pub(in crate::engine::peer) stand_ins: Vec<(u32, Vec<Rc<StandIn>>)>,
-    /// Asks for the routes.
+    /// Messages that ask for the routes.
     pub(in crate::engine::peer) messages: Vec<LinkMessage>,
 }
 
@@ -72,7 +72,7 @@ impl AskedRoute {
         self.incomplete = true;
     }
 
-    /// Returns how many responses its clients have not taken, and how many more found no room.
+    /// Returns the number of responses that its clients have not taken, and the number that found no room.
     pub(in crate::engine::peer) fn responses(&self) -> (u64, u64) {
         let clients = self.stand_ins.values();
         clients.fold((0, 0), |(waiting, refused), client| {
@@ -84,7 +84,7 @@ impl AskedRoute {
         })
     }
 
-    /// Returns the message that asks for it.
+    /// Returns the message that asks for the route.
     fn message(&self, key: &RouteKey) -> LinkMessage {
         let last = self.stand_ins.iter().filter_map(|(gid, stand_in)| {
             Some(LastSeen { publisher: *gid, sequence: stand_in.last_sequence()? })
@@ -102,7 +102,7 @@ impl AskedRoute {
     }
 }
 
-/// The routes that a peer was asked for, by what they carry and by number.
+/// The routes that a peer was asked for, by key and by number.
 pub(in crate::engine::peer) struct AskedRoutes {
     /// The most routes that the peer serves.
     most: usize,
@@ -127,12 +127,12 @@ impl AskedRoutes {
         }
     }
 
-    /// Returns the route that carries this.
+    /// Returns the route with this key.
     pub(in crate::engine::peer) fn get(&self, key: &RouteKey) -> Option<&AskedRoute> {
         self.routes.get(key)
     }
 
-    /// Returns what the route with this number carries.
+    /// Returns the key of the route with this number.
     pub(in crate::engine::peer) fn key_of(&self, number: u32) -> Option<&RouteKey> {
         self.keys.get(&number)
     }
@@ -153,13 +153,13 @@ impl AskedRoutes {
         self.next_number - 1
     }
 
-    /// Adds a route, in place of what [`take`](Self::take) took.
+    /// Adds a route, in place of the one that [`take`](Self::take) removed.
     pub(in crate::engine::peer) fn insert(&mut self, key: RouteKey, asked: AskedRoute) {
         self.keys.insert(asked.number, key.clone());
         self.routes.insert(key, asked);
     }
 
-    /// Takes a route out, to be changed. The peer may still have to be asked for it.
+    /// Removes a route so that it can be changed. The peer may still have to be asked for it.
     pub(in crate::engine::peer) fn take(&mut self, key: &RouteKey) -> Option<AskedRoute> {
         let asked = self.routes.remove(key)?;
         self.keys.remove(&asked.number);
@@ -183,7 +183,7 @@ impl AskedRoutes {
         self.routes.iter().map(|(key, asked)| asked.message(key)).collect()
     }
 
-    /// Has the peer asked for a route once the local readers of its stand-ins are attached.
+    /// Schedules the request for a route: the peer is asked once the local readers of its stand-ins are attached.
     pub(in crate::engine::peer) fn ask_once_attached(
         &mut self,
         number: u32,

@@ -1,4 +1,4 @@
-//! The limits on what crosses between this host and a peer, by route.
+//! The limits on traffic between this host and a peer, by route.
 
 use std::rc::Rc;
 
@@ -13,7 +13,7 @@ use crate::engine::{account::Account, limits::Limit};
 
 /// The limits that the access rules set for a peer.
 pub(in crate::engine::peer) struct PeerLimits<'a> {
-    /// Holds the state of the limits, for all daemons of the peer's identity.
+    /// The state of the limits, for all daemons of the peer's identity.
     pub(in crate::engine::peer) account: &'a Account,
     /// The rules about the peer.
     pub(in crate::engine::peer) permissions: &'a Permissions,
@@ -22,7 +22,8 @@ pub(in crate::engine::peer) struct PeerLimits<'a> {
 }
 
 impl PeerLimits<'_> {
-    /// Returns the limits on what the peer gets of a route that it asked for. No response is limited, and no request to it.
+    /// Returns the limits on the samples that the peer gets on a route that it asked for. Responses, and requests to
+    /// the peer, are not limited.
     pub(in crate::engine::peer) fn outgoing(&self, key: &RouteKey) -> Vec<Rc<Limit>> {
         match key.kind {
             Kind::Topic => self.of(Verb::Subscribe, key),
@@ -30,7 +31,7 @@ impl PeerLimits<'_> {
         }
     }
 
-    /// Returns the limits on what the peer sends here on a route that this host asked for.
+    /// Returns the limits on the messages that the peer sends here on a route that this host asked for.
     pub(in crate::engine::peer) fn incoming(&self, key: &RouteKey) -> Vec<Rc<Limit>> {
         match key.kind {
             Kind::Topic => self.of(Verb::Publish, key),

@@ -1,5 +1,5 @@
-//! Which topics a peer must send here, and under which QoS the engine asks for them on the
-//! other side: plain data in, data out. Beside it the routes that were asked for, served and refused.
+//! Selects the topics that a peer must send, and the QoS of each request. The functions take plain data and return
+//! plain data. The submodules hold the routes that were asked for, served and refused.
 
 pub(in crate::engine::peer) mod asked;
 pub(in crate::engine::peer) mod lanes;
@@ -33,22 +33,22 @@ use crate::{
 const CHECK: Duration = Duration::from_millis(5);
 /// The shortest time for each of these pairs, so that thousands of waiting pairs leave time for samples.
 const CHECK_EACH: Duration = Duration::from_micros(4);
-/// Returns what a route carries, from the number in a message.
+/// Returns the kind of a route from the number in a message.
 pub(in crate::engine::peer) fn kind_of(kind: u8) -> Option<Kind> {
     [Kind::Topic, Kind::Request, Kind::Response].into_iter().find(|k| *k as u8 == kind)
 }
 
-/// Returns the time until the next check of so many pairs.
+/// Returns the time until the next check of this number of pairs.
 pub(in crate::engine::peer) fn check_after(pairs: usize) -> Duration {
     CHECK.max(CHECK_EACH * u32::try_from(pairs).unwrap_or(u32::MAX))
 }
 
-/// What one route needs from one peer.
+/// The readers and writers of one route from one peer.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(crate) struct WantedRoute {
-    /// Readers here that some writer there serves.
+    /// Readers here that at least one writer of the peer serves.
     pub(crate) subscribers: Vec<RouteSubscriber>,
-    /// Writers there, and how many readers here each serves.
+    /// Writers of the peer, each with the number of readers here that it serves.
     pub(crate) writers: Vec<(Endpoint, usize)>,
 }
 
@@ -87,17 +87,16 @@ pub(crate) fn wanted<'a>(
     routes
 }
 
-/// Relays for one route.
+/// Most relays of one route.
 pub(in crate::engine::peer) const MAX_RELAYS_OF_ROUTE: usize = 16;
 
-/// The relays of a topic's route, those that ask for more first. `hash` gives the hash of a
-/// subscription's type.
+/// Returns the relays of a topic's route, the most demanding first. `hash` returns the hash of a subscription's type.
 ///
-/// Subscriptions are grouped by reliability, durability and type hash, because a relay must match
-/// exactly the publishers that its subscriptions match, and because only a reliable one may hold a
-/// publisher back; and by how much they keep, because which relay stands for a subscription must not
-/// change when others come or go: it would miss what is published meanwhile. So a publisher may be read
-/// by several; [`axon_transport::internal::session::merge`] sends each sample once.
+/// Subscriptions are grouped by reliability, durability and type hash for two reasons: a relay must match exactly the
+/// publishers that its subscriptions match, and only a reliable relay may hold a publisher back. They are also grouped
+/// by history and depth: the relay that stands for a subscription must not change when others come or go, because it
+/// would miss the samples that are published meanwhile. So several relays may read one publisher;
+/// [`axon_transport::internal::session::merge`] sends each sample once.
 pub(crate) fn relays(
     subscribers: &[RouteSubscriber],
     hash: impl Fn(&Gid) -> Vec<u8>,
@@ -106,7 +105,7 @@ pub(crate) fn relays(
     for subscriber in subscribers {
         let (offered, type_hash) = (subscriber.qos, hash(&subscriber.gid));
         let keeps_all = offered.history == History::KeepAll;
-        // Deadline, lifespan and liveliness are judged where the subscription lives.
+        // Deadline, lifespan and liveliness are checked on the subscription's host.
         let qos = Qos::default()
             .with_reliability(offered.reliability)
             .with_durability(offered.durability)
@@ -127,8 +126,8 @@ pub(crate) fn relays(
     groups.into_values().collect()
 }
 
-/// Leaves of `specs` those that there are already, and as many of the others as one route may have. How many it leaves
-/// out.
+/// Removes from `specs` the new relays beyond the limit of one route; existing relays stay. Returns the number of
+/// removed relays.
 pub(crate) fn admit(specs: &mut Vec<RelaySpec>, is_there: impl Fn(&RelaySpec) -> bool) -> usize {
     let (asked, there) = (specs.len(), specs.iter().filter(|spec| is_there(spec)).count());
     let mut more = MAX_RELAYS_OF_ROUTE.saturating_sub(there);
@@ -141,8 +140,8 @@ pub(crate) fn admit(specs: &mut Vec<RelaySpec>, is_there: impl Fn(&RelaySpec) ->
     asked - specs.len()
 }
 
-/// The depth of the relay that stands for a subscription of this depth: one of few, so that not each
-/// takes a relay of its own.
+/// Returns the depth of the relay for a subscription of this depth. There are few depths, so that not each subscription
+/// needs its own relay.
 fn class(depth: u32) -> u32 {
     let classes = (0..u32::BITS).step_by(4).map(|bits| 1 << bits);
     classes.skip(1).find(|class| *class >= depth).unwrap_or(u32::MAX)

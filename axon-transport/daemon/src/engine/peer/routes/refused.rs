@@ -1,4 +1,4 @@
-//! Routes that do not cross, by name: for status, for the log, and for the peer.
+//! Routes that are not served, by name: for the status, for the log, and for the peer.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -20,25 +20,25 @@ use crate::{
     link::{LinkMessage, RouteRefused, RouteUnasked},
 };
 
-/// Names that status lists.
+/// Most names that status lists.
 const MAX_LISTED_ROUTES: usize = 64;
 /// Bytes that count for a refused route besides its names and reason.
 const ENTRY_BYTES: usize = 200;
-/// Routes of a peer that status shows at the endpoints that wait for them.
+/// Most routes of a peer that status shows at the endpoints that wait for them.
 const MAX_ROUTES_AT_ENDPOINTS: usize = 1024;
-/// Characters of a peer's reason that are shown.
+/// Most characters of a peer's reason that are shown.
 const MAX_REASON_CHARS: usize = 200;
-/// What is shown where there is no room for a reason.
+/// Text for a reason for which there is no room.
 const UNREMEMBERED: &str = "too many are refused to remember why";
 
-/// Why this side asks for no more routes.
+/// The reason for which this side asks for no more routes.
 pub(in crate::engine::peer) const TOO_MANY_ASKED: &str = "the peer serves no more routes than this host has asked \
      for already; fewer topics subscribed to here make room";
-/// Why this side asks for no more publishers.
+/// The reason for which this side asks for no more publishers.
 pub(in crate::engine::peer) const TOO_MANY_WRITERS: &str = "the peer has more publishers and clients for this host \
      than are shown; fewer topics subscribed to here make room";
 
-/// Why a relay or a stand-in is not opened.
+/// The reason for which a relay or a stand-in is not opened.
 pub(in crate::engine::peer) const TOO_MANY_LANES: &str = "what a peer reads here takes as many connections to publishers, clients and \
      servers as a peer may have, or all peers";
 
@@ -48,32 +48,32 @@ struct RefusalReason {
     _charge: Option<Charge>,
 }
 
-/// Why a publisher or client is not shown, for the peer and for status.
+/// The reason for which a publisher or client is not shown, for the peer and for the status.
 pub(in crate::engine::peer) const NO_STAND_IN: &str =
     "the subscribers' host could not open a stand-in for a publisher; its log says why";
 
-/// Why requests of a peer are not asked for.
+/// The reason for which requests of a peer are not asked for.
 pub(in crate::engine::peer) const NOT_TAKEN: &str = "clients of the service did not take its responses; they are asked again later ([link] stalled_s)";
 
-/// The routes that are refused, and why.
+/// The refused routes, with the reasons.
 pub(in crate::engine::peer) struct RefusedRoutes {
-    /// What may be remembered, of all daemon ids of the peer's identity.
+    /// The bound on the remembered routes, for all daemon ids of the peer's identity.
     room: Rc<Meter>,
     /// Routes that this side does not ask for.
     unasked: BTreeMap<RouteKey, &'static str>,
-    /// Routes that the peer does not ask for, though it could.
+    /// Routes that the peer does not ask for, although it could.
     unwanted: BTreeMap<RouteKey, RefusalReason>,
     /// Routes that the peer does not serve, and when to ask again.
     unserved: BTreeMap<RouteKey, (RefusalReason, Option<Duration>)>,
-    /// Those of them that are asked for again, by that time.
+    /// Unserved routes that are asked for again, by the time of the next request.
     again: BTreeSet<(Duration, RouteKey)>,
-    /// Routes that the peer asked for and does not get, by its number.
+    /// Routes that the peer asked for and does not get, by the peer's number.
     theirs: BTreeMap<u32, (RouteKey, RefusalReason)>,
     logged: LogLimit,
 }
 
 impl RefusedRoutes {
-    /// Creates an empty list. `room` bounds what is remembered.
+    /// Creates an empty list. `room` bounds the remembered routes.
     pub(in crate::engine::peer) fn new(room: Rc<Meter>) -> Self {
         Self {
             room,
@@ -134,7 +134,7 @@ impl RefusedRoutes {
         gone.iter().for_each(|key| self.remove_unasked(key, messages));
     }
 
-    /// Tells the peer again over a new link, which loses what was sent over the link before and not received.
+    /// Repeats the messages over a new link, because messages over the earlier link may not have been received.
     pub(in crate::engine::peer) fn succeed(&mut self, messages: &mut ControlQueue) {
         self.unwanted.clear();
         let again = self.unasked.iter().map(|(key, why)| unasked(key, Some(*why)));
@@ -260,7 +260,7 @@ impl RefusedRoutes {
     /// Names the refused routes in the link's status.
     pub(in crate::engine::peer) fn fill(&self, status: &mut LinkStatus) {
         let mut listed = BTreeSet::new();
-        // Of thousands nothing but the number is shown.
+        // Beyond the limit the status shows only the number.
         for (key, by, why) in self.all() {
             if listed.len() < MAX_LISTED_ROUTES {
                 listed.insert(key);
@@ -281,7 +281,7 @@ impl RefusedRoutes {
         })
     }
 
-    /// Bytes of names and reasons.
+    /// Returns the bytes of names and reasons.
     #[cfg(test)]
     pub(in crate::engine::peer) fn held(&self) -> usize {
         let theirs = self.theirs.values().map(|(key, why)| (key, why));
@@ -290,7 +290,7 @@ impl RefusedRoutes {
     }
 }
 
-/// The side that keeps a route from crossing.
+/// The side that prevents a route.
 #[derive(Clone, Copy)]
 pub(in crate::engine::peer) enum RefusedSide {
     /// This host, which reads.
@@ -313,7 +313,7 @@ impl RefusedSide {
         }
     }
 
-    /// The endpoints of this host that wait for the route.
+    /// Returns the kind of this host's endpoints that wait for the route.
     pub(in crate::engine::peer) fn waits(self, kind: Kind) -> EndpointKind {
         let reads = matches!(self, Self::NotAsked | Self::Peer);
         match (kind, reads) {
@@ -325,7 +325,7 @@ impl RefusedSide {
     }
 }
 
-/// A reason of the peer, as it is shown.
+/// Returns a peer's reason as it is shown.
 pub(in crate::engine::peer) fn shown(reason: &str) -> String {
     reason.chars().filter(|c| !c.is_control()).take(MAX_REASON_CHARS).collect()
 }

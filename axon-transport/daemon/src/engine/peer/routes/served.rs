@@ -1,4 +1,4 @@
-//! The routes that a peer is served.
+//! The routes that this host serves a peer.
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashMap},
@@ -18,19 +18,19 @@ use crate::{
     link::RouteReady,
 };
 
-/// A route is said to be ready once it has a writer, or after this time.
+/// Longest wait for a writer before a route is reported as ready.
 const READY_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// A peer whose route access rules deny asks for it again after this time, if DENIED does not tell it when.
+/// A peer whose route access rules deny asks for it again after this time, unless DENIED reports the permission before.
 pub(in crate::engine::peer) const DENIED_AGAIN: Duration = Duration::from_secs(30);
-/// Routes that a peer is served. HELLO says it. What they take is bounded apart from it.
+/// Most routes that a peer is served. HELLO states this number. The memory of the routes has its own limit.
 pub(crate) const MAX_ROUTES: usize = 1 << 15;
 
-/// A route that was given up since the peer does not read it.
+/// A route that was given up because the peer does not read it.
 pub(crate) struct StalledRoute {
     /// The topic's name.
     pub(crate) topic: String,
-    /// What both hosts show.
+    /// The reason that both hosts show.
     pub(crate) reason: String,
     /// Samples that were lost.
     pub(crate) samples: u64,
@@ -42,27 +42,27 @@ pub(in crate::engine::peer) struct ServedRoute {
     pub(in crate::engine::peer) subscribers: Vec<Gid>,
     pub(in crate::engine::peer) sources: Vec<Source>,
     pub(in crate::engine::peer) _room: Charge,
-    /// One for each relay.
+    /// Charge of one per relay.
     pub(in crate::engine::peer) relays: Charge,
-    /// One for each relay and each publisher here that it may read.
+    /// Charge of one per relay and each publisher here that it may read.
     pub(in crate::engine::peer) lanes: Charge,
-    /// Why some of the subscribers get nothing, and when the peer may ask again.
+    /// The reason for which some of the subscribers get nothing, and the time until the peer may ask again.
     pub(in crate::engine::peer) without: Option<MissingRelay>,
-    /// Whether the peer asked for it over the link in use.
+    /// True if the peer asked for it over the link in use.
     pub(in crate::engine::peer) repeated: bool,
 }
 
-/// Why subscribers of a route have no relay, and after what time one may be had.
+/// The reason for a missing relay, and the time until a retry.
 pub(in crate::engine::peer) type MissingRelay = (String, Option<Duration>);
 
-/// Routes by number and by what they carry.
+/// Routes by number and by key.
 #[derive(Default)]
 pub(in crate::engine::peer) struct ServedRoutes {
     routes: HashMap<u32, ServedRoute>,
     numbers: HashMap<RouteKey, u32>,
     /// The routes of services.
     services: BTreeSet<u32>,
-    /// Routes whose readiness the peer was not told of, and until when that waits for a writer.
+    /// Routes whose readiness is not reported to the peer yet, each with the end of the wait for a writer.
     announcing: BTreeMap<u32, Duration>,
     look_at_announcing: Option<Duration>,
 }
@@ -80,7 +80,7 @@ impl ServedRoutes {
         self.routes.get_mut(&number)
     }
 
-    /// The number of the route that carries this.
+    /// Returns the number of the route with this key.
     pub(in crate::engine::peer) fn number_of(&self, key: &RouteKey) -> Option<u32> {
         self.numbers.get(key).copied()
     }
@@ -95,22 +95,22 @@ impl ServedRoutes {
         self.routes.iter_mut().map(|(number, served)| (*number, served))
     }
 
-    /// The routes of services, by number.
+    /// Returns the routes of services, by number.
     pub(in crate::engine::peer) fn services(&self) -> impl Iterator<Item = (u32, &ServedRoute)> {
         self.services.iter().filter_map(|number| Some((*number, self.routes.get(number)?)))
     }
 
-    /// How many routes of services there are.
+    /// Returns the number of routes of services.
     pub(in crate::engine::peer) fn service_count(&self) -> usize {
         self.services.len()
     }
 
-    /// Whether a route is of a service.
+    /// Returns whether a route belongs to a service.
     pub(in crate::engine::peer) fn is_service(&self, number: u32) -> bool {
         self.services.contains(&number)
     }
 
-    /// Adds a route, in place of what [`take`](Self::take) took.
+    /// Adds a route, in place of the one that [`take`](Self::take) removed.
     pub(in crate::engine::peer) fn insert(&mut self, number: u32, served: ServedRoute) {
         self.numbers.insert(served.key.clone(), number);
         if served.key.kind != Kind::Topic {
@@ -119,7 +119,7 @@ impl ServedRoutes {
         self.routes.insert(number, served);
     }
 
-    /// Takes a route out, to be changed. The peer may still be waiting to be told that it is ready.
+    /// Removes a route so that it can be changed. Its report as ready may still be pending.
     pub(in crate::engine::peer) fn take(&mut self, number: u32) -> Option<ServedRoute> {
         self.services.remove(&number);
         let served = self.routes.remove(&number)?;
@@ -127,7 +127,7 @@ impl ServedRoutes {
         Some(served)
     }
 
-    /// Ends a route.
+    /// Removes a route that ends.
     pub(in crate::engine::peer) fn remove(&mut self, number: u32) -> Option<ServedRoute> {
         self.announcing.remove(&number);
         self.take(number)
@@ -155,18 +155,18 @@ impl ServedRoutes {
         shortened
     }
 
-    /// Has the peer told when a route is ready.
+    /// Schedules the report that a route is ready.
     pub(in crate::engine::peer) fn announce(&mut self, number: u32, now: Duration) {
         self.announcing.insert(number, now + READY_TIMEOUT);
         self.look_at_announcing = Some(now);
     }
 
-    /// When [`take_ready`](Self::take_ready) is due.
+    /// Returns when [`take_ready`](Self::take_ready) is due.
     pub(in crate::engine::peer) fn poll_timeout(&self) -> Option<Duration> {
         self.look_at_announcing
     }
 
-    /// The routes that are ready by now and of which the peer was not told.
+    /// Returns the ready routes that were not reported to the peer yet.
     pub(in crate::engine::peer) fn take_ready(&mut self, now: Duration) -> Vec<RouteReady> {
         if self.look_at_announcing.is_none_or(|due| due > now) {
             return Vec::new();

@@ -29,7 +29,7 @@ pub(in crate::engine::peer) struct UnansweredServices {
     awaited: BTreeMap<RouteKey, AwaitedResponses>,
     /// Unfinished flows of ended routes, until the peer asks for the routes again.
     left: BTreeMap<RouteKey, UnfinishedFlows>,
-    /// When to check for responses that the peer does not ask for.
+    /// The time of the next check for responses that the peer does not ask for.
     look: Option<Duration>,
 }
 
@@ -38,7 +38,7 @@ pub(in crate::engine::peer) struct UnansweredServices {
 struct AwaitedResponses {
     /// Responses that had found no room at the first check.
     refused: u64,
-    /// How long the responses have waited since, added up at each check.
+    /// The time that the responses have waited since, added up at each check.
     waited: Duration,
 }
 

@@ -176,7 +176,7 @@ fn publishers_and_readers_that_end_within_long_messages_keep_no_others_out() {
 }
 
 #[test]
-fn a_peer_with_more_long_messages_in_flight_than_it_may_is_named_and_bounded() {
+fn peer_with_too_many_long_messages_in_flight_is_named_and_bounded() {
     const MANY: u32 = 200;
     let (mut world, number, route) = raw_publishers(87, MANY);
     let body = Bytes::from(vec![0x5a; 300 << 10]);

@@ -99,7 +99,7 @@ fn stop_within_messages(world: &mut World, id: u8) {
 }
 
 #[test]
-fn short_messages_that_have_not_all_come_are_bounded_over_all_ids_of_an_identity() {
+fn incomplete_short_messages_are_bounded_for_an_identity() {
     let mut world = World::new(80, 1, |_| Config::default());
     world.add_raw(Config::default(), DaemonId([0xff; 16]));
     let rate = Rate::new(1_000_000_000, millis(20));
@@ -199,7 +199,7 @@ fn subscribe(route: u32, topic: &str, subscriber: Gid) -> LinkMessage {
 }
 
 #[test]
-fn refused_routes_that_are_remembered_are_bounded_in_bytes_over_all_ids_of_an_identity() {
+fn bytes_of_refused_routes_are_bounded_for_an_identity() {
     let mut world = World::new(83, 1, |_| {
         let mut config = Config::default();
         config.link.graph = 1 << 20;
@@ -356,7 +356,7 @@ fn no_identity_takes_all_lanes_and_each_is_told_its_refused_routes() {
 }
 
 #[test]
-fn the_lanes_of_a_relay_that_is_kept_stay_charged_where_the_next_daemon_finds_none() {
+fn kept_relay_stays_charged_until_its_end() {
     const PUBLISHERS: usize = 200;
     let mut world = World::new(89, 1, |_| Config::default());
     world.add_raw(Config::default(), DaemonId([0xff; 16]));

@@ -184,7 +184,7 @@ fn an_endpoint_that_ends_while_its_daemons_predecessor_is_not_given_up_leaves_no
 
 #[test]
 #[cfg_attr(debug_assertions, ignore = "a debug assertion of quinn-proto fails")]
-fn two_hosts_that_swap_their_addresses_flow_again_soon_with_a_third_and_lose_nothing() {
+fn two_hosts_that_swap_addresses_resume_with_a_third_without_loss() {
     for (mode, config) in modes() {
         let mut world = World::new(45, 3, &config);
         let pairs = [(0, 1, "/a"), (2, 0, "/b"), (1, 2, "/c")]
@@ -207,7 +207,7 @@ fn two_hosts_that_swap_their_addresses_flow_again_soon_with_a_third_and_lose_not
 
 #[test]
 #[cfg_attr(debug_assertions, ignore = "a debug assertion of quinn-proto fails")]
-fn a_link_whose_path_is_cut_just_after_it_was_superseded_holds_nothing_up_for_long() {
+fn superseded_link_on_a_cut_path_holds_nothing_up_for_long() {
     for mode in [KeyMode::Session, KeyMode::Messages10] {
         let config = |host: usize| {
             let mut config = qkd(&format!("sae-{host}"), mode);

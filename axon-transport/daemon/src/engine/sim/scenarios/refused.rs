@@ -48,7 +48,7 @@ fn a_stand_in_that_cannot_be_opened_is_told_to_the_publishers_host() {
 }
 
 #[test]
-fn a_relay_that_cannot_be_opened_is_told_to_the_subscribers_host_which_asks_again() {
+fn unopened_relay_is_reported_to_the_host_of_the_subscriber_which_retries() {
     let (mut world, pair) = world(0);
     assert!(!flows(&mut world, pair));
     let [here, there] = refused(&world);

@@ -33,8 +33,8 @@ fn steps() -> impl Strategy<Value = Vec<Step>> {
 }
 
 proptest! {
-    /// No key seals an eleventh message, none is sealed under that is not READY on this very
-    /// connection, none on two connections, and whatever is sealed opens.
+    /// No key seals an eleventh message. A key seals only on the connection on which it is READY, and on no two
+    /// connections. Each sealed message opens.
     #[test]
     fn keys_are_used_as_they_should(steps in steps()) {
         let mut pair = Pair::new();

@@ -10,7 +10,7 @@ use crate::keys::{
     request::{Answer, FailureKind, Fetched, KmeRequest, RequestFailure},
 };
 
-/// The number of a call for keys.
+/// Returns the number of keys that a call requests.
 fn number(request: &KmeRequest) -> u32 {
     let KmeRequest::Enc { number, .. } = request else { panic!("{request:?}") };
     *number
@@ -124,11 +124,11 @@ fn answers_to_another_call_give_nothing_and_are_not_asked_for_in_a_loop() {
 }
 
 #[test]
-fn a_kme_that_repeats_itself_has_no_key_used_twice_and_is_not_asked_in_a_loop() {
+fn repeated_keys_of_a_kme_are_used_once_and_asked_for_at_a_bounded_rate() {
     let mut pair = Pair::new();
     pair.run();
     assert_eq!(pair.announced(), 4);
-    // All four are used up and retired, and then the KME counts from one again.
+    // All four keys are used up and retired, and then the KME counts from one again.
     pair.kmes.left = Some(0);
     while pair.seal(Delivery::Reliable).is_ok() {}
     pair.run();
@@ -177,7 +177,7 @@ fn keys_adopted_over_and_over_are_bounded() {
     let mut pair = Pair::new();
     for i in 0..5_000 {
         let key = KmeKey::from_slice(&[9; 32]).unwrap();
-        // Half of them on a connection that is not attached.
+        // Half of the keys are on a connection that is not attached.
         pair.sender.adopt(pair.now, i % 2, id(&format!("proof-{i}")), key).unwrap();
     }
     assert_eq!(pair.sender.statistics(pair.now).ready, 2_048);
@@ -249,7 +249,7 @@ fn a_shrinking_stock_warns_before_it_is_empty() {
         pair.run();
         pair.seal(Delivery::Reliable).unwrap();
         if tick == 499 {
-            // 15 came in meanwhile.
+            // 15 keys arrived meanwhile.
             pair.kmes.stock = 1_000 - drawn(&pair) + 15;
         }
         pair.now += ms(10);

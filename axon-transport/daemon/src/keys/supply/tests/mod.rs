@@ -1,4 +1,4 @@
-//! Tests a [`KeySender`] and a [`KeyReceiver`] with two KMEs between them, and a clock that stands still.
+//! Tests a [`KeySender`] and a [`KeyReceiver`] with two KMEs between them, and a clock that only the test moves.
 
 mod any_order;
 mod drawing;
@@ -25,7 +25,7 @@ fn id(text: &str) -> KeyId {
     KeyId::new(text).unwrap()
 }
 
-/// The exporters of connection `conn`, the same at both ends.
+/// Returns the exporters of connection `conn`, which are the same at both ends.
 fn exporters(conn: u64) -> Exporters {
     Exporters::new([conn as u8; 32], [!conn as u8; 32])
 }
@@ -36,9 +36,9 @@ struct Kmes {
     issued: u32,
     stored: HashMap<KeyId, [u8; 32]>,
     stock: u64,
-    /// Keys left to give; `None`: any number.
+    /// The number of keys left to give; `None`: any number.
     left: Option<u32>,
-    /// How the next calls fail.
+    /// The failures of the next calls, the last one first.
     failures: Vec<FailureKind>,
 }
 
@@ -89,12 +89,12 @@ struct Pair {
     sender: KeySender,
     receiver: KeyReceiver,
     conn: u64,
-    /// What was said in either direction.
+    /// The messages in both directions.
     log: Vec<KeyMessage>,
 }
 
 impl Pair {
-    /// Has the receiver's KME answer.
+    /// Answers the requests of the receiver to its KME.
     fn fetch(&mut self) {
         while let Some(request) = self.receiver.poll_request(self.now) {
             let answer = self.kmes.answer(request);
@@ -106,7 +106,7 @@ impl Pair {
         let mut pair = Self {
             now: ms(0),
             kmes: Kmes::default(),
-            // Every pause at its full length.
+            // Every pause has its full length.
             sender: KeySender::with_jitter("sae-a", "sae-b", || 255).unwrap(),
             receiver: KeyReceiver::new("sae-b", "sae-a").unwrap(),
             conn: 0,
@@ -116,7 +116,7 @@ impl Pair {
         pair
     }
 
-    /// The next connection; the one before stays open until `close` of it.
+    /// Attaches the next connection; the one before stays open until it is [closed](Self::close).
     fn connect(&mut self) {
         self.conn += 1;
         let owed = self.sender.attach(self.now, self.conn, &exporters(self.conn)).unwrap();
@@ -134,7 +134,7 @@ impl Pair {
         self.receiver.detach(self.now, conn);
     }
 
-    /// Makes the sender's calls and answers them until it makes no more.
+    /// Answers the sender's calls until it makes no more.
     fn draw(&mut self) {
         while let Some(request) = self.sender.poll_request(self.now) {
             let answer = self.kmes.answer(request);
@@ -142,7 +142,7 @@ impl Pair {
         }
     }
 
-    /// Lets everything happen that can happen now.
+    /// Performs everything that can happen at this time.
     fn run(&mut self) {
         loop {
             if let Some(request) = self.sender.poll_request(self.now) {

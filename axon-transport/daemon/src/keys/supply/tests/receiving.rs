@@ -47,7 +47,8 @@ fn a_late_announcement_on_a_connection_before_takes_no_key_from_its_successor() 
     }
 }
 
-/// Two daemons that dial each other have two connections at a time. That which was opened first may be elected last.
+/// Two daemons that dial each other have two connections at a time. The connection that was opened first may be elected
+/// last.
 #[test]
 fn a_key_goes_to_the_last_elected_connection_in_any_opening_order() {
     for is_fetched in [false, true] {
@@ -68,7 +69,7 @@ fn a_key_goes_to_the_last_elected_connection_in_any_opening_order() {
         pair.fetch();
         assert!(matches!(pair.receiver.poll_message(), Some((7, KeyMessage::Ready { .. }))));
         assert!(pair.receiver.opener(7).unwrap().contains(key_id.as_bytes()), "{is_fetched}");
-        // What was said on the connection before comes late.
+        // A message on the earlier connection arrives late.
         pair.receiver.handle_message(pair.now, 8, &announce).unwrap();
         assert!(pair.receiver.opener(7).unwrap().contains(key_id.as_bytes()), "{is_fetched}");
     }
@@ -169,7 +170,7 @@ fn contradicting_masks_end_the_link() {
 fn messages_that_never_came_are_counted_once() {
     let mut pair = Pair::new();
     pair.run();
-    // Three are sealed under one key, and one of them arrives.
+    // Three messages are sealed under one key, and one of them arrives.
     for arrives in [true, false, false] {
         let envelope = pair.seal(Delivery::BestEffort).unwrap();
         if arrives {
@@ -187,7 +188,7 @@ fn messages_that_never_came_are_counted_once() {
     pair.seal(Delivery::BestEffort).unwrap();
     pair.connect();
     pair.now += ms(5_000);
-    // The connection closes before the next look.
+    // The connection closes before the next check.
     pair.close(pair.conn - 1);
     assert_eq!(missing(&pair), 3);
     pair.receiver.handle_timeout(pair.now);

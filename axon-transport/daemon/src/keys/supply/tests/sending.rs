@@ -32,7 +32,7 @@ fn a_wrong_proof_retires_its_key_and_nothing_else() {
         pair.sender.handle_message(pair.now, 1, &ready).unwrap();
         let expected = retire(std::str::from_utf8(key_id.as_bytes()).unwrap(), 0, 0);
         assert_eq!(pair.sender.poll_message(pair.now), Some((1, expected)));
-        // Said again, it is about a key that nobody holds any more.
+        // A repeated READY concerns a key that neither side holds any more.
         pair.sender.handle_message(pair.now, 1, &ready).unwrap();
     }
     let statistics = pair.sender.statistics(pair.now);
@@ -43,7 +43,7 @@ fn a_wrong_proof_retires_its_key_and_nothing_else() {
     for unexpected in [KeyMessage::Announce(vec![id("k")]), retire("k", 0, 0)] {
         assert!(pair.sender.handle_message(pair.now, 1, &unexpected).is_err());
     }
-    // The others are as good as before.
+    // The other keys stay valid.
     let announce = KeyMessage::Announce(key_ids[2..].to_vec());
     pair.receiver.handle_message(pair.now, 1, &announce).unwrap();
     pair.run();
@@ -63,7 +63,7 @@ fn one_wrong_key_is_reported_and_gone_from_both_ends_for_good() {
     let report = pair.sender.disagreement(pair.now).unwrap();
     assert_eq!((report.key_id, report.keys), (wrong.clone(), 1));
     assert_eq!(pair.sender.disagreement(pair.now), None);
-    // Neither end brings it to the next connection.
+    // Neither end carries the key to the next connection.
     pair.close(1);
     let before = pair.log.len();
     pair.connect();
@@ -75,13 +75,13 @@ fn one_wrong_key_is_reported_and_gone_from_both_ends_for_good() {
     assert_eq!(pair.sender.statistics(pair.now).disagreed, 1);
 }
 
-/// An outage of the own KME excuses a peer that takes nothing. What the peer brings about does not.
+/// An outage of this host's KME excuses a peer that takes nothing. A lack of keys that the peer causes does not.
 #[test]
-fn keys_are_wanting_for_the_kme_only_where_no_key_is_left_or_was_refused_by_the_peer() {
+fn shortage_of_keys_blames_the_kme_only_if_none_is_left_or_refused() {
     let failed = |pair: &Pair| pair.sender.statistics(pair.now).last_failure.is_some();
     let mut pair = Pair::new();
     assert!(!pair.sender.lacks_keys_of_kme(), "nothing was asked for");
-    // A status that fails says nothing of keys.
+    // A failed status call says nothing about keys.
     pair.kmes.failures = vec![FailureKind::Unavailable];
     let request = pair.sender.poll_request(pair.now).unwrap();
     assert!(matches!(request, KmeRequest::Status { .. }));
@@ -94,7 +94,7 @@ fn keys_are_wanting_for_the_kme_only_where_no_key_is_left_or_was_refused_by_the_
     pair.draw();
     assert!(failed(&pair) && pair.sender.lacks_keys_of_kme());
 
-    // The peer has not answered for those that the KME gave before.
+    // The peer has not answered for the keys that the KME gave before.
     let mut pair = Pair::new();
     pair.draw();
     let (conn, announced) = pair.sender.poll_message(pair.now).unwrap();
@@ -104,14 +104,14 @@ fn keys_are_wanting_for_the_kme_only_where_no_key_is_left_or_was_refused_by_the_
     pair.sender.demand(pair.now, 1_000);
     pair.draw();
     assert!(failed(&pair) && !pair.sender.lacks_keys_of_kme());
-    // It fails them all, after the KME failed.
+    // The peer fails all of them, after the KME failed.
     for key_id in key_ids {
         assert!(!pair.sender.lacks_keys_of_kme());
         let failed = KeyMessage::Failed { key_id, reason: String::new() };
         pair.sender.handle_message(pair.now, conn, &failed).unwrap();
     }
     assert!(!pair.sender.lacks_keys_of_kme(), "the peer refused them");
-    // Until the next call fails.
+    // The state lasts until the next call fails.
     pair.now += Duration::from_secs(60);
     pair.draw();
     assert!(pair.sender.lacks_keys_of_kme());
@@ -132,7 +132,7 @@ fn a_peer_that_fails_every_proof_burns_few_keys() {
             }
             pair.now += ms(10);
         }
-        // A new connection is no new beginning.
+        // A new connection does not reset the pause.
         if second % 2 == 0 {
             pair.connect();
         }
@@ -177,7 +177,7 @@ fn unused_keys_move_to_the_next_connection_without_another_dec_keys() {
     assert_eq!(pair.failures(), 0);
     assert_eq!(pair.kmes.stored.len(), stored, "nothing was fetched twice");
     assert_eq!(pair.announced(), announced + 3 + 1, "three move, one is new");
-    // What was sealed on the old connection opens there, and there only.
+    // A message that was sealed on the old connection opens only there.
     let mut copy = envelope.clone();
     assert!(pair.open(envelope).is_err());
     let old = pair.receiver.opener(1).unwrap();
@@ -238,7 +238,7 @@ fn a_peer_that_refuses_every_key_burns_few() {
     assert!(pair.seal(Delivery::Reliable).is_ok(), "well again");
 }
 
-/// What a KME does that hangs: the keys that it was being asked for are lost.
+/// A KME that hangs has this effect: the keys that were requested from it are lost.
 #[test]
 fn many_keys_that_are_refused_together_are_one_cause_to_wait() {
     let mut pair = Pair::new();

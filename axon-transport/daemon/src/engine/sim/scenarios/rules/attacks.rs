@@ -218,7 +218,7 @@ fn requests_held_by_a_limit_are_dropped_once_rules_deny_them() {
 }
 
 #[test]
-fn rules_that_change_between_handshake_and_election_or_within_a_succession_count_from_then_on() {
+fn changed_rules_apply_during_handshake_election_and_succession() {
     const CLOSED: &str = "[[deny]]\npeer = \"*\"\npublish = \"/t\"";
     let mut world = world(OPEN, LOWEST);
     let subscription = world.hosts[0].rings.create_subscription("/t", Qos::keep_all(), None);
@@ -327,7 +327,7 @@ fn daemons_of_one_identity_have_its_rules_and_share_its_bucket() {
 }
 
 #[test]
-fn a_denied_peer_neither_speaks_for_an_endpoint_of_a_permitted_one_nor_keeps_it_out() {
+fn denied_peer_cannot_announce_or_block_an_endpoint_of_a_permitted_peer() {
     for claims_first in [true, false] {
         let mut world = World::apart(41, 2, |_| Config::default());
         world.add_raw(Config::default(), LOWEST);

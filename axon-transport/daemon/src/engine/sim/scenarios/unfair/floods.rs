@@ -36,7 +36,7 @@ fn long(number: u32) -> Endpoint {
 }
 
 #[test]
-fn a_stream_of_another_host_goes_on_while_a_peer_announces_12_000_long_endpoints() {
+fn stream_of_another_host_continues_during_12_000_announcements() {
     let mut world = World::new(96, 2, |_| Config::default());
     world.add_raw(Config::default(), DaemonId([0xff; 16]));
     let rate = Rate::new(1_000_000_000, millis(20));
