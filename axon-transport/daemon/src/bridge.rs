@@ -41,7 +41,7 @@ pub struct GatewayParts {
     pub config: Arc<Config>,
     /// The daemon.
     pub daemon: DaemonId,
-    /// The key from which the daemon's id is derived.
+    /// The key from which the daemon's id is derived; `None` if the system could not make one, so the id is random.
     pub daemon_key: Option<Arc<DaemonKey>>,
     /// The keys of the sessions. With them the gateway proves to peers that the sessions belong to this daemon.
     pub keys: Arc<SessionKeys>,
@@ -53,7 +53,7 @@ pub struct GatewayParts {
     pub orders: mpsc::Receiver<ToGateway>,
 }
 
-/// A route that is not served, although endpoints of this host and of the peer match.
+/// A route that either side refuses, wholly or in part, although endpoints of this host and of the peer match.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RefusedRoute {
     /// The topic or service.
@@ -66,8 +66,8 @@ pub struct RefusedRoute {
     pub reason: String,
 }
 
-/// A refused peer. Each kind has its own rate limit in the log and its own share of the refusals in the status, so a
-/// flood of one kind hides no other.
+/// The kind of a refused party: a peer, or a session or endpoint of this host. Each kind has its own rate limit in the
+/// log and its own share of the refusals in the status, so a flood of one kind hides no other.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RefusalKind {
     /// Known from a beacon alone; any host can send a beacon.

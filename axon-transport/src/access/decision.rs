@@ -10,7 +10,7 @@ pub struct Decision(pub(super) Reason);
 pub(super) enum Reason {
     /// There are no rules.
     NoRules,
-    /// No `[[allow]]` names the party, and no `[[deny]]` applies to it.
+    /// No `[[allow]]` names the party, and no `[[deny]]` denies the action.
     Open { file: Arc<str> },
     /// An `[[allow]]` names the party and the action.
     Allowed { file: Arc<str>, line: u32 },

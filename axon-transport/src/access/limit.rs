@@ -1,4 +1,4 @@
-//! `[[limit]]`: limits on the samples that a party sends to or receives from this host.
+//! `[[limit]]`: limits on the data that a party sends to or receives from this host, or that leaves by an interface.
 
 use std::{fmt, num::NonZeroU32, sync::Arc};
 
@@ -28,7 +28,7 @@ pub enum Overflow {
     DropOldest,
     /// Samples are dropped on arrival.
     DropNewest,
-    /// Samples wait for their turn. A KEEP_ALL publisher blocks meanwhile. For a KEEP_LAST publisher, the samples
+    /// Samples wait for their turn. A KEEP_ALL publisher waits with them. For a KEEP_LAST publisher, only the samples
     /// within its history depth wait.
     Hold,
 }

@@ -58,7 +58,7 @@ pub(super) fn parameters(node: &TopicPattern) -> Vec<(Verb, TopicPattern)> {
 }
 
 /// Returns the part of [`parameters`] that concerns only this node. A `[[deny]]` applies to no more, for two reasons:
-/// the topic of changes also carries those of other nodes, and a topic may have the node's name.
+/// the topic of changes also carries the changes of other nodes, and a topic may have the node's name.
 pub(super) fn parameter_services(node: &TopicPattern) -> Vec<(Verb, TopicPattern)> {
     below(node, Verb::Call, &PARAMETER_SERVICES).collect()
 }

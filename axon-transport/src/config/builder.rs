@@ -292,7 +292,7 @@ impl ConfigBuilder {
         self.set("AXON_SHM_COPY", u8::from(copy))
     }
 
-    /// Sets the users, besides the own one, whose daemon and sessions are trusted. Default none.
+    /// Sets the other users whose daemon and sessions are trusted. Default none.
     pub fn trusted_uids(self, uids: impl IntoIterator<Item = u32>) -> Self {
         self.list("AXON_TRUSTED_UIDS", uids)
     }

@@ -19,8 +19,8 @@ pub(crate) struct DaemonEnv {
 }
 
 impl DaemonEnv {
-    /// Returns the environment for a session that did not read its own: these settings alone, and no `axon.toml`
-    /// except `file`.
+    /// Returns the daemon's environment for a session that did not read its own environment: these settings alone,
+    /// and no `axon.toml` except `file`.
     pub(super) fn whole(
         settings: impl IntoIterator<Item = (OsString, OsString)>,
         file: Option<&Path>,

@@ -42,7 +42,7 @@ impl DaemonLocation {
     /// file.
     ///
     /// # Errors
-    /// The errors of [`from_env`](Self::from_env).
+    /// `ROS_DOMAIN_ID`, `AXON_RUNTIME_DIR` or `AXON_TRUSTED_UIDS` is wrong.
     pub fn resolve(
         env: impl IntoIterator<Item = (OsString, OsString)>,
         default_file: Option<&Path>,

@@ -25,7 +25,7 @@ enum Read {
     Withheld,
     /// The name itself is wrong.
     Name,
-    /// An access rule, at this place in its file.
+    /// The text of access rules is wrong at this place in its file.
     Place(String),
 }
 
@@ -68,8 +68,8 @@ impl ConfigError {
         &self.variable
     }
 
-    /// Returns the value that was read. `None` if there was no value, if the value may be a secret, or if
-    /// the error is about a name or an access rule.
+    /// Returns the value that was read. `None` if there was no value, if the value may be a secret, if a
+    /// name is wrong, or if the text of access rules is wrong.
     pub fn read(&self) -> Option<&str> {
         match &self.read {
             Read::Value(text) => Some(text),
@@ -94,7 +94,7 @@ impl fmt::Display for ConfigError {
             Read::Missing => f.write_str(": not set")?,
             Read::Withheld => f.write_str(": set (value not shown)")?,
             Read::Name => f.write_str(": unknown name")?,
-            // For an access rule, `accepted` is a complete sentence.
+            // For access rules, `accepted` is a complete message.
             Read::Place(at) => return write!(f, ": {at}: {}", OneLine(&self.accepted)),
         }
         write!(f, ", accepted: {}", OneLine(&self.accepted))
@@ -103,7 +103,7 @@ impl fmt::Display for ConfigError {
 
 impl std::error::Error for ConfigError {}
 
-/// External text, escaped and truncated so that it stays on one line.
+/// External text, escaped so that it stays on one line, and truncated after `LONGEST` characters.
 struct OneLine<'a>(&'a str);
 
 impl fmt::Display for OneLine<'_> {

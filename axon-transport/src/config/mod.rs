@@ -35,9 +35,9 @@ use sources::Given;
 
 pub use crate::access::TopicPattern;
 pub use builder::ConfigBuilder;
-pub use error::ConfigError;
-// `Config::resolve` reads files through these types, and the project's tests replace them. For this project's crates.
 pub use daemon_location::DaemonLocation;
+pub use error::ConfigError;
+// `Config::resolve` reads files through these types, and tests replace them. They are for this project's crates.
 #[doc(hidden)]
 pub use files::{FileFacts, FileKind, Files, OsFiles};
 pub use model::{

@@ -29,8 +29,8 @@ pub struct Config {
     pub daemon: DaemonPolicy,
     /// The daemon's program (`AXON_DAEMON_PATH`).
     pub daemon_path: Option<PathBuf>,
-    /// Directory for the daemon's files: `AXON_RUNTIME_DIR`, otherwise `$XDG_RUNTIME_DIR/axon`. `None` if neither is
-    /// set.
+    /// Directory for the daemon's files: `AXON_RUNTIME_DIR`, otherwise `$XDG_RUNTIME_DIR/axon`. `None` if neither
+    /// variable is an absolute path.
     pub runtime_dir: Option<PathBuf>,
     /// True if `AXON_RUNTIME_DIR` was set. The directory then also holds the session socket.
     pub socket_in_runtime_dir: bool,
@@ -50,13 +50,13 @@ pub struct Config {
     pub shm: bool,
     /// True if samples of more than 4 KiB are copied when they are taken (`AXON_SHM_COPY`).
     pub shm_copy: bool,
-    /// Users, besides the own one, whose daemon and sessions are trusted (`AXON_TRUSTED_UIDS`).
+    /// Other users whose daemon and sessions are trusted (`AXON_TRUSTED_UIDS`).
     pub trusted_uids: Vec<u32>,
     /// Log filter in the syntax of `tracing` (`AXON_LOG`).
     pub log: String,
     /// Access rules of `AXON_ACCESS_FILE` or `axon.toml`.
     pub access: AccessRules,
-    /// The file of the access rules. `None` without rules.
+    /// The file of the access rules, or `/dev/null` if `AXON_ACCESS_FILE` disables rules. `None` without either.
     pub access_file: Option<PathBuf>,
     /// The section `[link]` of `axon.toml`.
     pub link: LinkConfig,

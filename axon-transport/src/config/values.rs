@@ -269,7 +269,7 @@ impl<F: Files> Values<'_, F> {
 /// Description of the values that [`absolute_directory`] accepts.
 pub(super) const DIRECTORY: &str = "the absolute path of a directory";
 
-/// Returns `text` as an absolute path if a directory or nothing is there.
+/// Returns the path `text` if it is absolute and no other file than a directory is there.
 pub(super) fn absolute_directory(text: &str, files: &impl Files) -> Option<PathBuf> {
     let path = PathBuf::from(text);
     let taken = files.facts(&path).is_ok_and(|facts| facts.kind != FileKind::Directory);

@@ -56,8 +56,8 @@ impl SessionOptions {
     }
 
     /// Limits the session to the permissions of an enclave. The session creates no endpoint that they do not allow.
-    /// The graph still shows all endpoints. When the permissions expire, existing endpoints stay, and no other one is
-    /// created.
+    /// The permissions do not limit what the graph shows. When they expire, existing endpoints stay, and no other one
+    /// is created.
     #[cfg(feature = "sros2")]
     #[must_use]
     pub fn permissions(mut self, permissions: EnclavePermissions) -> Self {

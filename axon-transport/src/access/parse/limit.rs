@@ -53,7 +53,7 @@ pub(crate) fn bytes_a_second(text: &str) -> Result<f64, &'static str> {
     (BYTES.0..=BYTES.1).contains(&bytes).then_some(bytes).ok_or(ACCEPTED)
 }
 
-/// Parses a rate, as TOML writes a number or an integer.
+/// Parses a rate, written as an integer or a float of TOML.
 ///
 /// # Errors
 /// The accepted values.

@@ -23,7 +23,7 @@ pub(super) struct AnnouncedMemory {
     announced: AnnouncedSegments,
     /// Publishers without prepared memory for their next large sample.
     low: BTreeSet<Gid>,
-    /// The time of the next check of the memory of large samples. `None` if there is none.
+    /// The time of the next check of the memory of large samples. `None` if no check is scheduled.
     check: Option<Instant>,
 }
 

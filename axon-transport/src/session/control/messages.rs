@@ -142,7 +142,7 @@ impl ControlThread {
         }
     }
 
-    /// Counts samples of a publisher that ended before this session received its grant to one of its readers.
+    /// Counts the lost samples of a publisher that ended before this session received the grant for its reader.
     fn unmet(&self, Unmet { reader, writer, samples }: Unmet) {
         let subscription = self.shared.state().endpoints.subscriptions.get(&reader).cloned();
         let Some(subscription) = subscription else { return };
@@ -306,7 +306,7 @@ impl ControlThread {
         let peer = self.hold(attach.session, pair, descriptors, &attach.segments);
         let shared = self.shared.clone();
         let own = attach.session == shared.core.id;
-        // Two own endpoints must not end between the check and the grant.
+        // If both endpoints are the session's own, neither may end between the check and the grant.
         let own_pairs = own.then(|| shared.lock_own_pairs());
         let Some(publisher) = self.shared.state().endpoints.publishers.get(&attach.writer).cloned()
         else {
@@ -416,7 +416,7 @@ impl ControlThread {
                 subscription.lock().add(mapped, after, numbers);
                 drop(own_pairs);
                 self.matches.add_reader(&subscription);
-                // The writer may have history to take.
+                // The subscription may have history of the writer to take.
                 self.shared.core.segment.notify();
             }
             Err(error) => {

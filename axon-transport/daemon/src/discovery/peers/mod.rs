@@ -206,7 +206,7 @@ impl PeerDiscovery {
         ids.into_iter().for_each(|id| self.schedule_dial(now, id));
     }
 
-    /// Sets the interfaces of this host after each check.
+    /// Sets the interfaces of this host, as the latest check found them.
     pub(crate) fn set_interfaces(&mut self, now: Duration, interfaces: Vec<Interface>) {
         if self.here.interfaces == interfaces {
             return;
@@ -311,7 +311,7 @@ impl PeerDiscovery {
         self.dial_due(now);
     }
 
-    /// Returns whether a dial can succeed and the range permits this daemon to look for the peer.
+    /// Returns whether a dial makes sense now and the range permits this daemon to look for the peer.
     fn wants_dial(&self, record: &DaemonRecord, standing: AddressConfidence) -> bool {
         let in_range = match self.local.range {
             DiscoveryRange::Off => false,

@@ -114,7 +114,7 @@ impl PeerDiscovery {
     }
 
     /// Handles a goodbye in the daemon's name, which another host may have sent. Probes the daemon, which is forgotten
-    /// if it does not answer in time. If too many probes are in flight, the goodbye is ignored.
+    /// if it does not answer in time. If the probe is not sent, the goodbye is ignored and a dial is scheduled.
     pub(super) fn leaves(&mut self, now: Duration, daemon: DaemonId) {
         let Some(record) = self.records.get(&daemon) else { return };
         let Some(best) = record.sources.first() else { return self.forget(daemon) };
@@ -130,8 +130,8 @@ impl PeerDiscovery {
         }
     }
 
-    /// Like [`leaves`](Self::leaves), for a daemon that other hosts claim too. Probes the addresses on this host that
-    /// are known by beacons alone. An address is forgotten if no daemon answers there in time.
+    /// Like [`leaves`](Self::leaves), for a goodbye from `host` under an id that other addresses claim too. Probes the
+    /// addresses of `host` that are known by beacons alone. An address is forgotten if no daemon answers there in time.
     pub(super) fn leaves_host(&mut self, now: Duration, daemon: DaemonId, host: IpAddr) {
         let Some(record) = self.records.get(&daemon) else { return };
         let heard =

@@ -217,7 +217,7 @@ impl DaemonRecord {
         self.sources.first().map_or(AddressConfidence::Heard, DialAddress::standing)
     }
 
-    /// Returns whether a dial to addresses of this standing can succeed.
+    /// Returns whether a dial to addresses of this standing makes sense now.
     pub(super) fn wants_dial(&self, standing: AddressConfidence) -> bool {
         let Some(source) = self.to_dial(standing).next() else { return false };
         let elsewhere =

@@ -1,5 +1,6 @@
-//! Dials a peer: each candidate address in turn. In qkd all attempts use one bootstrap key, which is dialled again
-//! until the peer's KME has it (`docs/formats.md`, section 2).
+//! Dials a peer: each candidate address in turn. In qkd all addresses are dialled with the same bootstrap key. The key
+//! is dialled again until the peer's KME has it, or until the dialler gives the key up and requests another one
+//! (`docs/formats.md`, section 2).
 //!
 //! The machine has no `handle_timeout`: [`poll_action`](Dialling::poll_action) does the work that is due.
 
@@ -35,7 +36,7 @@ pub(crate) struct Dialling {
     deadline: Duration,
     limit: Duration,
     state: DialPhase,
-    /// Reason of the last wait; each reason is logged once.
+    /// Reason of the last wait; a wait is logged only if its reason differs from this one.
     waited_for: String,
 }
 
@@ -359,7 +360,7 @@ impl Dialling {
         None
     }
 
-    /// Returns the keyring, the peer's SAE ID and the key of a round.
+    /// Returns the keyring, the peer's SAE ID and the key of a round; `None` in classic.
     fn key<'a>(
         &'a self,
         round: &'a DialRound,

@@ -316,8 +316,8 @@ impl Opening {
         self.fail(now, late, None, keyring);
     }
 
-    /// Derives the peer's SAE from the PSK, in qkd. A server spends the PSK here, because the client's Finished was
-    /// verified.
+    /// Starts the first step. A server in qkd reads the peer's SAE from the identity of the PSK. It spends the PSK
+    /// here, because the client's Finished was verified. A client in qkd expects the SAE that it dialled.
     fn begin(
         &mut self,
         now: Duration,

@@ -32,7 +32,7 @@ impl ControlQueue {
     }
 
     /// Queues [`LinkClosed`] for a link whose packets may not arrive, and repeats it for earlier links: the link that
-    /// takes over may have come before their messages left.
+    /// takes over may have come before their messages left. `None` only repeats.
     pub(super) fn say_closed(&mut self, closed: Option<LinkClosed>) {
         self.closed.extend(closed);
         let before = self.closed.len().saturating_sub(SAID_CLOSED);

@@ -34,7 +34,7 @@ struct Relays {
     sources: Vec<Source>,
     /// The relays among them that were taken over from another daemon of the peer's host.
     adopted: Vec<Gid>,
-    /// The unfinished flows of the adopted relays.
+    /// The unfinished flows of the adopted relays, or those of the service's earlier route.
     unfinished: UnfinishedFlows,
     without: Option<MissingRelay>,
 }
@@ -165,7 +165,7 @@ impl Peer {
             .is_some_and(|served| subscriptions.iter().any(|gid| served.subscribers.contains(gid)))
     }
 
-    /// Returns the subscribers that belong to the peer's own sessions.
+    /// Returns the subscribers that belong to the peer's own sessions, and disowns the others.
     fn proven_only(
         &mut self,
         mut subscribers: Vec<RouteSubscriber>,
@@ -226,8 +226,8 @@ impl Peer {
         lost.into_iter().for_each(|route| self.unserve(route));
     }
 
-    /// Opens the relays of a topic and keeps the relays that the route has. `places` and `lanes` are the charges of the
-    /// kept relays at first, and of all relays at the end.
+    /// Opens the relays of a topic, and leaves relays open that the route already has. `places` and `lanes` are the
+    /// charges of the route's earlier relays on entry, and of all its relays on return.
     fn open_relays(
         &self,
         key: &RouteKey,

@@ -25,8 +25,8 @@ use crate::{
 /// in flight, and the bytes that leave before the next pass. All other bulk waits in the flows, where a newer sample
 /// can replace it.
 const MOST_BULK: u64 = 16 << 20;
-/// Bulk that QUIC holds beyond the congestion window, in bytes. It is at most half of a small window and at least an
-/// eighth of a large one. On a slow path 64 KiB would take a quarter of a second.
+/// Bulk that QUIC holds beyond the congestion window, in bytes, but at most half of the window and at least an eighth
+/// of it. On a slow path 64 KiB would take a quarter of a second.
 const AHEAD: u64 = 64 << 10;
 /// Interval between measurements of the share of lost packets, and least number of packets in a measurement.
 const LOSS_EVERY: (Duration, u64) = (Duration::from_millis(100), 20);
@@ -38,7 +38,7 @@ const LOSES: f64 = 0.01;
 const MOST_ROUNDS: f64 = 6.0;
 /// Additional bytes that QUIC holds for all other classes.
 const RESERVE: u64 = 1 << 20;
-/// If a limit lets fewer bytes leave in this time, QUIC holds that number instead.
+/// If a limit lets fewer bytes than [`RESERVE`] leave in this time, QUIC holds that number instead.
 const RESERVE_TIME: Duration = Duration::from_millis(80);
 
 /// A QUIC connection.

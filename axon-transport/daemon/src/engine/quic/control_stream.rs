@@ -140,7 +140,7 @@ impl ControlStream {
         self.limits = limits;
     }
 
-    /// Charges waiting messages, to be sent or to be handled, to this account from now on.
+    /// Charges messages that are queued or decompressed from now on to this account.
     pub(in crate::engine) fn charge_to(&mut self, account: &Account) {
         self.meter = Some(Rc::clone(&account.unsent));
         self.decoded = Some(Rc::clone(&account.decoded));
@@ -181,7 +181,7 @@ impl ControlStream {
         (self.queued, self.piece.len() + self.frame.len())
     }
 
-    /// Returns whether frames wait.
+    /// Returns whether frames, or the end of the output, wait to be sent.
     pub(in crate::engine) fn has_output(&self) -> bool {
         !self.out.is_empty() || self.finishing && !self.finished
     }
@@ -342,7 +342,7 @@ impl ControlStream {
             }
         };
         let next = chunks.next(usize::MAX);
-        // The frames that this call wants to send leave with the pass.
+        // The packets that QUIC now wants to send leave with the pass.
         let _ = chunks.finalize();
         match next {
             Ok(Some(chunk)) => {

@@ -7,7 +7,8 @@ use std::time::Duration;
 const SPAN: (Duration, u32) = (Duration::from_millis(50), 4);
 /// Minimum share of the window sent per round trip; below it, the peer or the path limited the output.
 const OF_WINDOW: f64 = 0.5;
-/// Maximum ratio of a rate to the rate of the measurement before: a link begins slowly.
+/// Maximum ratio of a rate to the rate of the measurement before: a link begins slowly. A rate above the last known one
+/// counts at any ratio.
 const STEADY: f64 = 1.25;
 /// Maximum age of a rate. Compressed samples may leave the link idle, so that no new measurement replaces the rate.
 const BELIEVED: Duration = Duration::from_secs(30);
@@ -89,7 +90,7 @@ mod tests {
         assert_eq!(rate.get(ms(99)), None, "one measure");
         run(&mut rate, 100, 0, &mut left, 1_000);
         assert_eq!(rate.get(ms(100)), Some(1e6));
-        // Slower, but as fast as the window permits.
+        // A slower rate counts too: more than half of the window left in each round trip.
         run(&mut rate, 101, 100, &mut left, 600);
         let slower = rate.get(ms(201)).unwrap();
         assert!((slower - 6e5).abs() < 1e4, "{slower}");

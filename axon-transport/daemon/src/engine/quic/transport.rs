@@ -78,8 +78,8 @@ pub(crate) fn endpoint_config(reset_key: &[u8; 32]) -> EndpointConfig {
 /// The longest time for which a peer may delay the acknowledgement of a lone packet. QUIC's default of 25 ms would be
 /// most of a round trip on a local path, and the retransmit timeout grows with it.
 const ACK_DELAY: Duration = Duration::from_millis(2);
-/// Most packets that a peer may receive without an immediate acknowledgement; this is the usual number. Under heavy
-/// loss each acknowledgement counts.
+/// Most ack-eliciting packets that a peer may receive without an immediate acknowledgement: with 1, the usual value, it
+/// acknowledges every second one at once. Under heavy loss each acknowledgement counts.
 const ACK_THRESHOLD: u32 = 1;
 /// The round trip that is assumed for a private path until one was measured. QUIC's default of 333 ms is for the
 /// Internet: with it, the loss of a first packet delays the link by a second.

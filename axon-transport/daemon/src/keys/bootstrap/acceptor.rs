@@ -74,7 +74,7 @@ pub enum Lookup {
     OwnSaeId,
     /// The identity does not have AXON's form.
     Malformed,
-    /// A limit on calls to the KME is reached; the text names the limit.
+    /// A limit on calls to the KME is reached, or the client has to wait after failed proofs; the text says which.
     Limited(&'static str),
     /// The last call to the KME for this key failed for this reason. The KME is being asked again.
     KmeFailed(String),
@@ -100,7 +100,7 @@ impl fmt::Display for Lookup {
 
 /// The keys with which this host accepts handshakes. The daemon has one acceptor; clones share it.
 ///
-/// Look-ups happen inside the TLS handshake, on the thread that drives it. So all methods take `&self`, and the time
+/// Look-ups happen inside the TLS handshake, on whatever thread drives it. So all methods take `&self`, and the time
 /// comes from a [`Clock`].
 #[derive(Clone)]
 pub struct Acceptor(Arc<AcceptorInner>);
@@ -295,7 +295,7 @@ impl Acceptor {
         let inner = &*self.0;
         let Ok(parsed) = PskIdentity::parse(identity) else { return (Lookup::Malformed, None) };
         let Ok(key_id) = KeyId::new(parsed.key_id()) else { return (Lookup::Malformed, None) };
-        // An identity has only one spelling: a copy in another spelling would count as another key here.
+        // Only one encoding of an identity is accepted: here the same key in another encoding would count as another.
         if parsed.to_bytes() != identity {
             return (Lookup::Malformed, None);
         }

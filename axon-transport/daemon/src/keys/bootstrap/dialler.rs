@@ -54,7 +54,7 @@ pub enum DialDecision {
 
 /// The key of a dial. Attempts may overlap: the first that succeeds spends the key for all.
 pub struct DialKey {
-    /// The id of the key, which reports about this attempt name.
+    /// The id of the key. The caller passes it in its reports about this attempt.
     pub key_id: KeyId,
     /// The PSK, for [`axon_tls::quic::qkd_client`].
     pub psk: Arc<Psk>,

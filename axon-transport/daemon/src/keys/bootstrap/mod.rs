@@ -17,6 +17,7 @@ pub use dialler::{BootstrapDialler, DialDecision, DialKey, DialRefusal};
 pub enum Completion {
     /// The handshake was the first under its key. The key is erased now.
     First,
-    /// The key had completed a handshake before: the connection must be closed with `KEY_REUSED`.
+    /// The handshake was not the first under its key, or this host no longer holds the key. The connection must be
+    /// closed with `KEY_REUSED`.
     Reused,
 }

@@ -26,7 +26,7 @@ impl<K: Clone + Eq + std::hash::Hash> SeenSet<K> {
         Self { capacity, seen: HashMap::new(), order: VecDeque::new() }
     }
 
-    /// Adds `key`. Returns false if it was remembered already; its time is then `now`.
+    /// Adds `key` with the time `now`, which replaces an earlier time. Returns false if `key` was remembered already.
     pub(super) fn insert(&mut self, now: Duration, key: K) -> bool {
         let new = self.seen.insert(key.clone(), now).is_none();
         if !new {

@@ -20,7 +20,7 @@ const CLOSE: f64 = 0.8;
 /// Minimum time between two warnings.
 const WARN_EVERY: Duration = Duration::from_secs(10);
 
-/// A warning that the messages need nearly as many keys as the KME gives.
+/// A warning that the messages need nearly as many keys as the KME gives, or more.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SupplyWarning {
     /// Keys per second that the messages need.

@@ -23,7 +23,7 @@ const REFUSED: (Duration, Duration) = (Duration::from_millis(100), Duration::fro
 const MAKE_UP: u32 = 4;
 /// Most rounds that are counted, so that a recovered peer is served again soon.
 const ROUNDS_MAX: u32 = 10;
-/// Consecutive rounds after which at most [`FEW_KEYS`] keys are held ahead, until one is READY.
+/// Least number of uncompensated rounds at which at most [`FEW_KEYS`] keys are held ahead.
 const ROUNDS_OF_MANY: u32 = 2;
 /// Most keys held ahead after [`ROUNDS_OF_MANY`].
 const FEW_KEYS: usize = 4;
@@ -47,7 +47,7 @@ pub(super) struct KeyStock {
     rounds: u32,
     /// The time of the last refused round.
     refused: Option<Duration>,
-    /// READYs since the last compensated round.
+    /// READYs since the last round that was compensated or refused.
     readied: u32,
     /// True if the last call for keys brought none, and the peer has refused none since.
     fails: bool,

@@ -187,8 +187,9 @@ impl KeySender {
         self.link.as_ref().map(|link| link.conn)
     }
 
-    /// Adds a key that the peer has proven to hold on `conn`, as READY. The key is dropped if it was used before, or if
-    /// there are too many keys.
+    /// Adds a key that the peer has proven to hold on `conn`, as READY. If `conn` is not attached, the key has to be
+    /// announced instead. The key is dropped if its key_ID was there before or cannot be announced, or if there are too
+    /// many keys.
     ///
     /// # Errors
     /// The system returns no random bytes.

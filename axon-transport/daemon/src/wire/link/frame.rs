@@ -61,7 +61,8 @@ pub(crate) fn is_known(frame: &[u8]) -> bool {
     frame.first().is_some_and(|kind| LinkMessage::is_known(kind & !COMPRESSED))
 }
 
-/// Returns the bytes of the map in `frame` (without its length) after decompression, as the frame states them.
+/// Returns the number of bytes of the map in `frame` (without its length) after decompression, as the frame states it.
+/// For an uncompressed map it is the length of `frame`.
 pub fn unpacked_length(frame: &[u8]) -> usize {
     match frame.split_first() {
         Some((kind, body)) if kind & COMPRESSED != 0 => {

@@ -34,7 +34,7 @@ pub(in crate::engine::peer) struct AskedRoute {
     /// True if a writer of it is not shown.
     pub(in crate::engine::peer) incomplete: bool,
     pub(in crate::engine::peer) stand_ins: HashMap<Gid, Rc<StandIn>>,
-    /// Charge of one per stand-in, on the limit of writers that the route may show of the peer's identity.
+    /// Charge of one per stand-in, against the limit of writers that the route may show for the peer's identity.
     pub(in crate::engine::peer) places: Charge,
     /// Charge of one per stand-in and each writer here that it may read.
     pub(in crate::engine::peer) lanes: Charge,

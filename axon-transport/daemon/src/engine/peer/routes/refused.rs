@@ -1,4 +1,4 @@
-//! Routes that are not served, by name: for the status, for the log, and for the peer.
+//! Routes that either side refuses, by name: for the status, for the log, and for the peer.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
