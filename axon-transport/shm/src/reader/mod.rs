@@ -3,26 +3,28 @@
 mod awaited;
 mod batch;
 mod next_sample;
+mod options;
 pub(crate) mod sample;
+mod segment_cache;
 pub(crate) mod slice;
 mod unconfirmed;
 
 use std::{
-    sync::{Arc, Weak, atomic::AtomicU64},
+    sync::{Arc, atomic::AtomicU64},
     time::Instant,
 };
 
+pub use self::options::ReaderOptions;
 use self::{
     awaited::AwaitedSegment,
     next_sample::{Bytes, Descriptors},
+    segment_cache::SegmentCache,
     unconfirmed::UnconfirmedSamples,
 };
 use crate::{
     alloc::pin_limit::PinLimit,
     error::{ShmError, TakeError},
     ids::Gid,
-    memory::segment::Map,
-    qos::Qos,
     reader::sample::Sample,
     ring::{
         layout::{self, Location},
@@ -34,7 +36,6 @@ use crate::{
     session::{
         activity::WatchKey,
         attachment::{Attachment, Pinning},
-        lane::Lane,
         peer::{RingPeer, SegmentLookup},
     },
     sync::Ordering,
@@ -43,28 +44,6 @@ use crate::{
 
 /// Maximum number of attempts of a take if a publisher keeps overtaking it.
 const ATTEMPTS: u32 = 16;
-/// Number of segments that a reader finds without a lock.
-const KNOWN: usize = 4;
-
-/// The data that a reader needs about the ring that it is granted.
-pub struct ReaderOptions {
-    /// The subscription.
-    pub reader: Gid,
-    /// The publisher.
-    pub writer: Gid,
-    /// The publisher's session.
-    pub peer: RingPeer,
-    /// The ring's location in that session's memory.
-    pub ring: Location,
-    /// The lane by which the reader attached.
-    pub lane: Lane,
-    /// The publisher's grant.
-    pub grant: Grant,
-    /// The QoS that the subscription requests.
-    pub qos: Qos,
-    /// The largest sample to expect, in bytes.
-    pub max_message: u64,
-}
 
 /// One subscription's view of one publisher's ring.
 ///
@@ -75,8 +54,8 @@ pub struct Reader {
     attachment: Arc<Attachment>,
     /// `None` until the first look-up.
     descriptors: Option<Descriptors>,
-    /// Maps of the segments of recent samples.
-    maps: Vec<(u32, Weak<Map>)>,
+    /// The segments of recent samples.
+    segments: SegmentCache,
     awaited: AwaitedSegment,
     cursor: u64,
     /// Samples that the caller confirms explicitly. Boxed: few readers have any, and the fields that each take reads
@@ -90,12 +69,6 @@ pub struct Reader {
     corrupt: Option<&'static str>,
     /// True if the reader gave up the ring: the publisher is gone, and memory of it never came.
     given_up: bool,
-}
-
-/// The reason why a reader cannot read a sample.
-enum ReadObstacle {
-    Missing(u32),
-    Corrupt(&'static str),
 }
 
 /// The constant properties of a reader.
@@ -147,7 +120,7 @@ impl Reader {
         Ok(Self {
             attachment,
             descriptors: None,
-            maps: Vec::new(),
+            segments: SegmentCache::default(),
             awaited: AwaitedSegment::default(),
             cursor: grant.first,
             under_way: None,

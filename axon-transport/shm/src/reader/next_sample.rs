@@ -6,7 +6,7 @@ use std::{
     time::Instant,
 };
 
-use super::{ATTEMPTS, Attachment, KNOWN, ReadObstacle, Reader, awaited::Wait};
+use super::{ATTEMPTS, Attachment, Reader, awaited::Wait};
 use crate::{
     error::TakeError,
     memory::{copy, segment::Map},
@@ -17,6 +17,12 @@ use crate::{
     },
     session::peer::SegmentLookup,
 };
+
+/// The reason why a reader cannot read a sample.
+pub(super) enum ReadObstacle {
+    Missing(u32),
+    Corrupt(&'static str),
+}
 
 /// The location of a ring's descriptors.
 pub(super) struct Descriptors {
@@ -202,24 +208,12 @@ impl Reader {
         if slot && len <= COPIED_ALWAYS || !slot && len > COPIED {
             return Err(ReadObstacle::Corrupt("a sample is in the wrong kind of place"));
         }
-        let known = self.maps.iter().find(|(number, _)| *number == at.segment);
-        let map = match known.and_then(|(_, map)| map.upgrade()) {
-            Some(map) => map,
-            None => match self.reads.peer.find(at.segment) {
-                SegmentLookup::Map(map) => {
-                    // Few segments are in use at a time, and one that is not cached is looked up again.
-                    self.maps.retain(|(number, _)| *number != at.segment);
-                    if self.maps.len() >= KNOWN {
-                        self.maps.remove(0);
-                    }
-                    self.maps.push((at.segment, Arc::downgrade(&map)));
-                    map
-                }
-                SegmentLookup::Refused => {
-                    return Err(ReadObstacle::Corrupt("a sample is in memory that was refused"));
-                }
-                SegmentLookup::Absent => return Err(ReadObstacle::Missing(at.segment)),
-            },
+        let map = match self.segments.find(&self.reads.peer, at.segment) {
+            SegmentLookup::Map(map) => map,
+            SegmentLookup::Refused => {
+                return Err(ReadObstacle::Corrupt("a sample is in memory that was refused"));
+            }
+            SegmentLookup::Absent => return Err(ReadObstacle::Missing(at.segment)),
         };
         let outside = ReadObstacle::Corrupt("a sample lies outside its segment");
         let limit = map.words().len();
