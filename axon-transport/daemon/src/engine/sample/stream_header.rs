@@ -5,9 +5,9 @@ use axon_shm::ids::Gid;
 /// Length of a stream's header in bytes.
 pub(in crate::engine) const HEADER: usize = 24;
 /// A stream of RELIABLE samples, of requests, or of responses.
-pub(in crate::engine) const RELIABLE: u8 = 1;
+const RELIABLE: u8 = 1;
 /// A stream of one BEST_EFFORT sample.
-pub(in crate::engine) const BEST_EFFORT: u8 = 2;
+const BEST_EFFORT: u8 = 2;
 /// A flag: the messages have short headers.
 const SHORT_HEADERS: u8 = 1;
 /// A flag: the sender waits for RECEIVED for these requests or responses, and responses are numbered by their flow.
