@@ -324,8 +324,10 @@ impl Engine {
         let binding = link.binding();
         let Some(permissions) = link.permissions(&self.access) else { return };
         self.links.limit_egress(number, &permissions);
-        if let Some(old) = old.filter(|_| self.peers.get(daemon).is_some()) {
-            let old = self.links.connection(old).map(|connection| &mut connection.quic);
+        if let Some(superseded) = old.filter(|_| self.peers.get(daemon).is_some()) {
+            // The ends of its streams leave in this pass: samples on the new link wait for them.
+            self.links.touch(superseded);
+            let old = self.links.connection(superseded).map(|connection| &mut connection.quic);
             self.peers.with(daemon, |peer, with| {
                 // Before anything is said of this host's graph.
                 peer.set_permissions(permissions, with.config, now);
