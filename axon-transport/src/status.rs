@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 
 pub use self::{
     limit::LimitStatus,
-    link::{CompressedStatus, LinkStatus, WaitingStatus},
+    link::{CompressedStatus, LinkStatus, StandbyStatus, WaitingStatus},
 };
 
 /// The whole status of a daemon.

@@ -197,6 +197,8 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
         static_peer: true,
         routes: Some(1024),
         proof: Some(DaemonProof { key: [5; 32], signature: [6; 64] }),
+        paths: Some(2),
+        beside: Some([8; 16]),
     };
     let gid = Gid([6; 16]);
     let key_id = KeyId::new("bc490419-7d60-487f-adc1-4ddcc177c139").unwrap();
@@ -213,7 +215,9 @@ pub fn link_frame_seeds() -> Vec<Vec<u8>> {
     let mask = |bits| IndexMask::from_bits(bits).unwrap();
     let messages = [
         LinkMessage::Hello(hello),
-        LinkMessage::Elected(link::Elected { link: [9; 16], election: 3 }),
+        LinkMessage::Elected(link::Elected { link: [9; 16], election: 3, standby: None }),
+        LinkMessage::Elected(link::Elected { link: [9; 16], election: 3, standby: Some(true) }),
+        LinkMessage::SwitchOver,
         LinkMessage::Graph(graph(1)),
         LinkMessage::Graph(graph(64)),
         LinkMessage::GraphResync(link::GraphResync { version: 2 }),

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use axon_transport::status::{CompressedStatus, LinkStatus, WaitingStatus};
+use axon_transport::status::{CompressedStatus, LinkStatus, StandbyStatus, WaitingStatus};
 
 use super::{dash, nanoseconds};
 use crate::text::{self, TextTable, grouped};
@@ -22,6 +22,7 @@ pub(super) fn paths(links: &[LinkStatus]) -> TextTable {
         "compressed",
         "waiting",
         ">oldest",
+        "second path",
     ]);
     for link in links {
         let time = |time: Duration| text::duration(nanoseconds(time));
@@ -38,9 +39,17 @@ pub(super) fn paths(links: &[LinkStatus]) -> TextTable {
             compressed(&link.compressed),
             waiting(&link.waiting),
             time(link.oldest_waits),
+            second_path(link.standby.as_ref()),
         ]);
     }
     table
+}
+
+/// The address of the link that stands by, and its round trip.
+fn second_path(standby: Option<&StandbyStatus>) -> String {
+    standby.map_or_else(dash, |standby| {
+        format!("{}, {}", standby.address, text::duration(nanoseconds(standby.rtt)))
+    })
 }
 
 /// How many samples were compressed, and their bytes before and after.

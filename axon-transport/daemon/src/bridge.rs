@@ -213,6 +213,14 @@ pub enum ToGateway {
         /// The confidence in the addresses; the answer repeats it.
         standing: AddressConfidence,
     },
+    /// Sets the addresses at which discovery knows a linked peer, best first: the candidates for a second path. Any
+    /// host can send the beacons that they are from.
+    Addresses {
+        /// The peer.
+        daemon: DaemonId,
+        /// At most eight addresses.
+        addresses: Vec<SocketAddr>,
+    },
     /// Send a discovery datagram from the QUIC port.
     SendDatagram {
         /// The receiver's address.

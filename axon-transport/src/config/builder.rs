@@ -408,4 +408,11 @@ impl ConfigBuilder {
         };
         self.set("AXON_LINK_COMPRESSION", word)
     }
+
+    /// Sets the maximum number of links with one peer at a time, each to another address of the peer: 1 or 2. With 2 a
+    /// second link stands by, and takes over when the path of the first one does not answer. Both hosts must have it.
+    /// Default 1.
+    pub fn link_paths(self, paths: u8) -> Self {
+        self.set("AXON_LINK_PATHS", paths.to_string())
+    }
 }

@@ -395,6 +395,9 @@ pub struct LinkConfig {
     pub congestion: Congestion,
     /// Compression of samples for other hosts.
     pub compression: LinkCompression,
+    /// Maximum number of links with one peer at a time, each to another address of the peer: 1 or 2. With 2 a second
+    /// link stands by, and takes over when the path of the first one does not answer. Both hosts must have it.
+    pub paths: u8,
 }
 
 /// Polling of the daemon for the next input before it sleeps (`AXON_LINK_POLL`).
@@ -448,6 +451,7 @@ impl Default for LinkConfig {
             qlog: None,
             congestion: Congestion::Auto,
             compression: LinkCompression::Auto,
+            paths: 1,
         }
     }
 }

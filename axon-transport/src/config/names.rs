@@ -52,6 +52,7 @@ pub(super) const LINK: &[&str] = &[
     QLOG,
     "AXON_LINK_CONGESTION",
     "AXON_LINK_COMPRESSION",
+    "AXON_LINK_PATHS",
 ];
 
 /// Settings that name files. A relative path depends on the current directory of the process.

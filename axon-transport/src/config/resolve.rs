@@ -22,6 +22,8 @@ const MIB: u64 = 1 << 20;
 const LONGEST_SOCKET_PATH: usize = 107;
 /// Maximum number of static peers, as in rcl.
 const MOST_ROS_PEERS: usize = 32;
+/// Maximum value of `[link] paths`.
+const MAX_PATHS: u8 = 2;
 
 pub(super) fn resolve(
     env: impl IntoIterator<Item = (OsString, OsString)>,
@@ -372,8 +374,9 @@ fn link(values: &Values<'_, impl Files>) -> Result<LinkConfig, ConfigError> {
             "qlog" => link.qlog = Some(qlog(&name, value, &place, values.files)?),
             "congestion" => link.congestion = word(&name, value, &place, &CONGESTION)?,
             "compression" => link.compression = word(&name, value, &place, &COMPRESSION)?,
+            "paths" => link.paths = number(1, MAX_PATHS.into(), "paths")? as u8,
             _ => {
-                let known = "grace_s, stalled_s, mtu, graph_mb, held_mb, poll, qlog, congestion, compression";
+                let known = "grace_s, stalled_s, mtu, graph_mb, held_mb, poll, qlog, congestion, compression, paths";
                 return Err(ConfigError::name(&name, known).at(place));
             }
         }
@@ -405,6 +408,9 @@ fn link(values: &Values<'_, impl Files>) -> Result<LinkConfig, ConfigError> {
     }
     if let Some(compression) = values.choice("AXON_LINK_COMPRESSION", &COMPRESSION)? {
         link.compression = compression;
+    }
+    if let Some(paths) = values.number("AXON_LINK_PATHS", 1..=MAX_PATHS.into(), "paths")? {
+        link.paths = paths as u8;
     }
     Ok(link)
 }

@@ -9,6 +9,17 @@ use serde::{Deserialize, Serialize};
 
 use super::{LimitStatus, times};
 
+/// A link that stands by over another path, and takes over when the path of the link in use does not answer.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[non_exhaustive]
+pub struct StandbyStatus {
+    /// The peer's address and port there.
+    pub address: String,
+    /// Round-trip time; microseconds in JSON.
+    #[serde(rename = "rtt_us", with = "times::micros")]
+    pub rtt: Duration,
+}
+
 /// A link to another host's daemon.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[non_exhaustive]
@@ -78,6 +89,9 @@ pub struct LinkStatus {
     /// How long the oldest of them has waited; milliseconds in JSON.
     #[serde(default, rename = "waiting_ms", with = "times::millis")]
     pub oldest_waits: Duration,
+    /// The second link to the peer, which stands by over another path.
+    #[serde(default)]
+    pub standby: Option<StandbyStatus>,
     /// Samples received.
     pub samples_in: u64,
     /// Samples sent.

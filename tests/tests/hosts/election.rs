@@ -53,7 +53,7 @@ impl Elector {
     }
 
     fn elect(&self, met: &mut Met, election: u64) {
-        let elected = Elected { link: [election as u8; 16], election };
+        let elected = Elected { link: [election as u8; 16], election, standby: None };
         self.stranger.say(met, &LinkMessage::Elected(elected));
     }
 

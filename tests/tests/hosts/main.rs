@@ -38,6 +38,7 @@ mod mixed;
 mod mode;
 mod outage;
 mod pair;
+mod paths;
 mod process;
 mod qlog;
 mod quic;

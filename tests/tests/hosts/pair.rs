@@ -48,6 +48,8 @@ pub(crate) struct Plan {
     pub(crate) other_domain: bool,
     /// Whether only what lies between them leads from one to the other: [`Host::wire`].
     pub(crate) wired: bool,
+    /// How many wires lead from one to the other, where they are `wired`.
+    pub(crate) paths: usize,
     /// Whether they list each other; if not, multicast on the loopback has to do.
     pub(crate) listed: bool,
 }
@@ -61,6 +63,7 @@ impl Plan {
             graph_mb: None,
             other_domain: false,
             wired: false,
+            paths: 1,
             listed: true,
         }
     }
@@ -80,8 +83,12 @@ impl Plan {
         let net = [(16 + pair % 200) as u8, (1 + pid % 250) as u8];
         let lease = Arc::new(DomainLease::next(pid.wrapping_mul(31) + 2 * pair));
         let domain = lease.0;
-        let [addresses, ends] =
-            [[1, 2], [4, 3]].map(|of| of.map(|host| Ipv4Addr::new(127, net[0], net[1], host)));
+        let [addresses, ends, second_ends] = [[1, 2], [4, 3], [6, 5]]
+            .map(|of| of.map(|host| Ipv4Addr::new(127, net[0], net[1], host)));
+        let ends = [0, 1].map(|host| match self.paths {
+            1 => ends[host].to_string(),
+            _ => format!("{},{}", ends[host], second_ends[host]),
+        });
         [0, 1].map(|host| {
             let lists = self.listed && !self.wired;
             let peers = if lists { addresses[1 - host].to_string() } else { String::new() };
@@ -91,10 +98,10 @@ impl Plan {
                 ("ROS_DOMAIN_ID", (domain + u32::from(self.other_domain && host == 1)).to_string()),
             ];
             if self.wired {
-                more.push(("AXON_ADVERTISE_ADDRS", ends[host].to_string()));
+                more.push(("AXON_ADVERTISE_ADDRS", ends[host].clone()));
                 more.push(("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST".to_owned()));
                 if host == 0 {
-                    more.push(("ROS_STATIC_PEERS", ends[1].to_string()));
+                    more.push(("ROS_STATIC_PEERS", ends[1].replace(',', ";")));
                 }
             }
             let settings = self.settings[host].iter().cloned().chain(more);
@@ -204,12 +211,21 @@ impl Host {
 
     /// The wire to this host, which runs already, of a plan that is `wired`.
     pub(crate) fn wire(&self) -> Wire {
+        self.wire_at([3, 4])
+    }
+
+    /// The second wire of a plan with two paths.
+    pub(crate) fn second_wire(&self) -> Wire {
+        self.wire_at([5, 6])
+    }
+
+    fn wire_at(&self, [near, far]: [u8; 2]) -> Wire {
         let at = |host| {
             let [a, b, c, _] = self.address.octets();
             Ipv4Addr::new(a, b, c, host)
         };
         let port = self.status().port.unwrap();
-        Wire::between((at(3), port).into(), (at(4), 0).into(), (self.address, port).into())
+        Wire::between((at(near), port).into(), (at(far), 0).into(), (self.address, port).into())
     }
 
     fn command(&self, program: &str) -> Command {

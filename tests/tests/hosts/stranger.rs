@@ -88,7 +88,10 @@ impl Stranger {
         let to = SocketAddr::from((host.address, status.port.unwrap()));
         let mut met = self.meet(to, host.domain(), auth, claim)?;
         if claim.daemon.to_string() < status.daemon {
-            self.say(&mut met, &LinkMessage::Elected(Elected { link: [7; 16], election: 1 }));
+            self.say(
+                &mut met,
+                &LinkMessage::Elected(Elected { link: [7; 16], election: 1, standby: None }),
+            );
             self.hear(&mut met, |message| !matches!(message, LinkMessage::Elected(_)))?;
         } else {
             self.hear(&mut met, |message| matches!(message, LinkMessage::Elected(_)))?;
@@ -229,6 +232,8 @@ fn hello(domain: u32, claim: &Claim<'_>) -> LinkHello {
         static_peer: false,
         routes: None,
         proof: None,
+        paths: None,
+        beside: None,
     }
 }
 

@@ -128,7 +128,7 @@ mod tests {
     use crate::link::{Elected, RouteReady};
 
     fn elected(election: u64) -> LinkMessage {
-        LinkMessage::Elected(Elected { link: [7; 16], election })
+        LinkMessage::Elected(Elected { link: [7; 16], election, standby: None })
     }
 
     #[test]

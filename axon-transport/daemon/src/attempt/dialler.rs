@@ -94,6 +94,7 @@ impl AttemptDialler {
                 listed: false,
                 standing: None,
                 replaces: None,
+                beside: None,
             },
             keys,
             epoch: Instant::now(),

@@ -182,7 +182,7 @@ impl AcceptedLink {
         let proof = prove(session, &binding, self.dialler.daemon())
             .ok_or_else(|| internal("the session cannot be proved"))?;
         let messages = [
-            LinkMessage::Elected(Elected { link: rand::random(), election: 1 }),
+            LinkMessage::Elected(Elected { link: rand::random(), election: 1, standby: None }),
             LinkMessage::Owners(Owners { proofs: vec![proof] }),
             LinkMessage::Graph(graph),
         ];

@@ -205,6 +205,9 @@ impl DaemonGateway {
                     self.tell(DiscoveryEvent::DialFailed { daemon, standing });
                 }
             }
+            DiscoveryAction::Addresses { daemon, addresses } => {
+                self.order(ToGateway::Addresses { daemon, addresses });
+            }
             DiscoveryAction::SendFromQuicPort { to, bytes } => {
                 self.order(ToGateway::SendDatagram { to, bytes });
             }

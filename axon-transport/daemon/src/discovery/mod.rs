@@ -77,6 +77,13 @@ pub(crate) enum DiscoveryAction {
         /// Why it may be there; the answer says it again.
         standing: AddressConfidence,
     },
+    /// A linked peer has these addresses, best first; they are candidates for a second path.
+    Addresses {
+        /// The peer.
+        daemon: DaemonId,
+        /// At most eight addresses.
+        addresses: Vec<SocketAddr>,
+    },
     /// Send this from the QUIC port, best effort.
     SendFromQuicPort {
         /// Where to.

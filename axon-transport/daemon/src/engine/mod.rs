@@ -151,8 +151,12 @@ impl Engine {
                 }
                 let replaces = self.links.cut_link(daemon);
                 let (daemon, standing) = (Some(daemon), Some(standing));
-                let target = DialTarget { daemon, sae, addresses, listed, standing, replaces };
+                let target =
+                    DialTarget { daemon, sae, addresses, listed, standing, replaces, beside: None };
                 self.links.dial(target, now);
+            }
+            ToGateway::Addresses { daemon, addresses } => {
+                self.links.set_addresses(daemon, &addresses);
             }
             ToGateway::SendDatagram { to, bytes } => self.links.send_datagram(to, bytes),
             ToGateway::Rules(rules, number) => {

@@ -49,6 +49,8 @@ impl LinkHello {
             static_peer: false,
             routes: None,
             proof: None,
+            paths: (config.link.paths > 1).then_some(config.link.paths),
+            beside: None,
         }
     }
 

@@ -30,6 +30,8 @@ enum OrderStep {
     /// qkd: the client's name is being proven.
     Proof,
     Election,
+    /// The connection stands by beside the link in use.
+    Standby,
     Open,
 }
 
@@ -65,8 +67,15 @@ impl MessageOrder {
 
     /// This side elected the connection, or the peer's ELECTED was accepted.
     pub fn elected(&mut self) {
-        if self.step == OrderStep::Election {
+        if matches!(self.step, OrderStep::Election | OrderStep::Standby) {
             self.step = OrderStep::Open;
+        }
+    }
+
+    /// Records that the connection was elected to stand by.
+    pub fn stands_by(&mut self) {
+        if self.step == OrderStep::Election {
+            self.step = OrderStep::Standby;
         }
     }
 
@@ -94,6 +103,11 @@ impl MessageOrder {
                 OrderStep::Proof,
             ) => self.side == Side::Server,
             (LinkMessage::Elected(_), OrderStep::Election) => self.peer_elects,
+            (LinkMessage::Elected(elected), OrderStep::Standby) => {
+                self.peer_elects && elected.standby != Some(true)
+            }
+            // The side that elects need not ask. The request may cross its ELECTED.
+            (LinkMessage::SwitchOver, OrderStep::Standby | OrderStep::Open) => !self.peer_elects,
             (LinkMessage::Keepalive, step) => step != OrderStep::Hello,
             // Key announcements exist in qkd alone.
             (LinkMessage::Keys(_), OrderStep::Open) => self.qkd,
@@ -108,6 +122,7 @@ impl MessageOrder {
             OrderStep::Hello => "before HELLO",
             OrderStep::Proof => "before the client's name is proven",
             OrderStep::Election => "before the link is elected",
+            OrderStep::Standby => "while the link stands by",
             OrderStep::Open => "on an open link",
         };
         Err(OutOfOrder { message: message.name(), when })
@@ -120,6 +135,7 @@ impl LinkMessage {
         match self {
             Self::Hello(_) => "HELLO",
             Self::Elected(_) => "ELECTED",
+            Self::SwitchOver => "SWITCH_OVER",
             Self::Graph(_) => "GRAPH",
             Self::GraphResync(_) => "GRAPH_RESYNC",
             Self::Subscribe(_) => "SUBSCRIBE",

@@ -70,3 +70,26 @@ fn the_higher_id_cannot_elect_and_classic_knows_no_keys() {
     order.elected();
     assert!(order.accept(&LinkMessage::Keys(KeyMessage::Announce(vec![key_id("k")]))).is_err());
 }
+
+#[test]
+fn link_that_stands_by_is_put_in_use_by_the_lower_id_at_the_request_of_the_higher() {
+    let standby = LinkMessage::Elected(Elected { link: [9; 16], election: 4, standby: Some(true) });
+    for peer_elects in [true, false] {
+        let mut order = MessageOrder::new(Side::Server, false);
+        order.accept(&messages()[0]).unwrap();
+        order.hello_checked(peer_elects);
+        assert!(order.accept(&LinkMessage::SwitchOver).is_err(), "before the election");
+        assert_eq!(order.accept(&standby).is_ok(), peer_elects);
+        order.stands_by();
+        assert!(order.accept(&standby).is_err(), "it stands by already");
+        assert!(order.accept(&LinkMessage::Graph(GraphUpdate::default())).is_err());
+        assert!(order.accept(&LinkMessage::Keys(KeyMessage::Announce(vec![key_id("k")]))).is_err());
+        order.accept(&LinkMessage::Keepalive).unwrap();
+        assert_eq!(order.accept(&LinkMessage::SwitchOver).is_ok(), !peer_elects);
+        assert_eq!(order.accept(&elected()).is_ok(), peer_elects);
+        order.elected();
+        assert!(order.accept(&elected()).is_err(), "a third ELECTED");
+        assert_eq!(order.accept(&LinkMessage::SwitchOver).is_ok(), !peer_elects, "it crossed");
+        order.accept(&LinkMessage::Graph(GraphUpdate::default())).unwrap();
+    }
+}

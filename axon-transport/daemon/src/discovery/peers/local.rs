@@ -24,6 +24,8 @@ pub(crate) struct LocalDaemon {
     pub bind: Vec<IpAddr>,
     /// `AXON_ADVERTISE_ADDRS`.
     pub advertise: Vec<IpAddr>,
+    /// True if links may have two paths: `[link] paths`.
+    pub has_two_paths: bool,
 }
 
 impl LocalDaemon {
@@ -42,6 +44,7 @@ impl LocalDaemon {
             range: DiscoveryRange::Off,
             bind: config.bind_addrs.clone(),
             advertise: config.advertise_addrs.clone(),
+            has_two_paths: config.link.paths > 1,
         }
     }
 }

@@ -4,6 +4,7 @@
 //! Any host can send a beacon, so a beacon is only a hint. Every collection is bounded, and every answer is
 //! rate-limited. No received datagram closes a link, or prevents a link to a peer that was acceptable before.
 
+mod addresses;
 mod announcing;
 mod candidates;
 mod dialling;
@@ -33,7 +34,7 @@ use self::{
     candidates::LocalAddresses,
     eviction::EvictionCandidates,
     probing::Probes,
-    record::{DaemonRecord, DialAddress},
+    record::{DaemonRecord, DialAddress, ReportedAddresses},
 };
 use super::{AddressConfidence, DiscoveryAction, Interface};
 
@@ -267,6 +268,8 @@ impl PeerDiscovery {
         record.done();
         record.proved(address);
         record.found(address, proven);
+        record.reported_addresses = ReportedAddresses::default();
+        self.report_addresses(now, daemon);
         self.schedule_dial(now, daemon);
         self.dial_due(now);
     }

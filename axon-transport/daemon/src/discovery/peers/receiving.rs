@@ -105,6 +105,7 @@ impl PeerDiscovery {
                     asked: false,
                     leaving: None,
                 });
+                self.report_addresses(now, daemon);
                 self.schedule_dial(now, daemon);
                 self.ask_if_contested(now, daemon, observed);
             }

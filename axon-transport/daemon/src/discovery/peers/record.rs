@@ -84,11 +84,19 @@ pub(super) struct DaemonRecord {
     pub(super) unproven: Option<UnprovenAddresses>,
     /// One entry per standing: a dial to an unused address delays no better one.
     pub(super) dials: [DialTime; AddressConfidence::COUNT],
+    pub(super) reported_addresses: ReportedAddresses,
 }
 
 /// The address of a linked peer that did not prove its id, and the other addresses where it was found.
 #[derive(Debug, Default)]
 pub(super) struct UnprovenAddresses(Vec<SocketAddr>);
+
+/// The addresses that the gateway was told of one linked peer.
+#[derive(Debug, Default)]
+pub(super) struct ReportedAddresses {
+    pub(super) addresses: Vec<SocketAddr>,
+    pub(super) at: Option<Duration>,
+}
 
 /// The dial schedule of one standing.
 #[derive(Debug, Default)]

@@ -385,7 +385,7 @@ pub(crate) fn cost(message: &LinkMessage) -> u32 {
         }
         LinkMessage::Subscribe(subscribe) => 7 + subscribe.subscribers.len() + subscribe.last.len(),
         // Waiting flows are tried again.
-        LinkMessage::ReceiveLimits(_) => 63,
+        LinkMessage::ReceiveLimits(_) | LinkMessage::SwitchOver => 63,
         LinkMessage::Unsubscribe(_)
         | LinkMessage::RouteRefused(_)
         | LinkMessage::RouteUnasked(_) => 7,

@@ -33,6 +33,8 @@ pub(crate) struct DialTarget {
     pub(crate) standing: Option<AddressConfidence>,
     /// The link that the new connection succeeds.
     pub(crate) replaces: Option<[u8; 16]>,
+    /// The link in use beside which the new connection stands by.
+    pub(crate) beside: Option<[u8; 16]>,
 }
 
 impl DialTarget {
@@ -51,6 +53,7 @@ impl DialTarget {
             expects: self.daemon,
             static_peer: self.listed,
             replaces: self.replaces,
+            beside: self.beside,
             ..ours.clone()
         }
     }

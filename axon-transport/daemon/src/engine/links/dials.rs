@@ -131,9 +131,9 @@ impl Dials {
         self.opening.extend(of.map(|of| (connection, of)));
     }
 
-    /// Returns the daemon that this connection was dialled for, while it is being opened.
-    pub(super) fn expected(&self, connection: u64) -> Option<DaemonId> {
-        self.opening.get(&connection).map(|(daemon, _)| *daemon)
+    /// Returns whether a dial to this daemon is under way.
+    pub(super) fn is_dialling(&self, daemon: DaemonId) -> bool {
+        self.under_way.values().any(|dial| dial.dialling.target().daemon == Some(daemon))
     }
 
     /// Records that the opening of a dialled connection succeeded.

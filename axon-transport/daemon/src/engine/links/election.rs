@@ -38,7 +38,7 @@ const MAX_LINKS: usize = 128 + 32;
 /// Maximum number of links of one proven identity.
 const MAX_LINKS_OF_PEER: usize = 16;
 /// The text for a peer that claims the id of another one.
-const OTHERS: &str = "this daemon id is that of another host";
+pub(super) const OTHERS: &str = "this daemon id is that of another host";
 
 impl Links {
     /// Handles that a connection's peer sent HELLO and proved its name.
@@ -49,10 +49,13 @@ impl Links {
         };
         let OpenedConnection { hello, negotiated, order, sealing } = opened;
         let (side, address) = (link.side, connection.quic.remote_address());
-        let replaces = if side == Side::Server { hello.replaces } else { link.replaces };
+        let (replaces, beside) = match side {
+            Side::Server => (hello.replaces, hello.beside),
+            Side::Client => (link.replaces, link.beside),
+        };
         let (daemon, ours) = (hello.daemon, self.hello.daemon);
         // The other end compares, too. A peer that does not report a difference must not count as found.
-        if let Some(expected) = self.dials.expected(number).filter(|expected| *expected != daemon) {
+        if let Some(expected) = link.expected.filter(|expected| *expected != daemon) {
             let why = format!("daemon id is {daemon} there, and {expected} was dialled");
             return self.turn_away(number, &hello, why, now);
         }
@@ -84,7 +87,7 @@ impl Links {
         }
         let current = self.table.current_peer(daemon);
         let of_identity = self.table.of_identity(&who);
-        let links = self.table.peers().count();
+        let links = self.table.in_use_count();
         let is_new = current.is_none();
         let too_many = if of_identity >= MAX_LINKS_OF_PEER {
             Some("this peer has as many connections as it may")
@@ -107,12 +110,15 @@ impl Links {
         let successor = replaced || current.is_some_and(|peer| peer.silence.is_gone());
         let candidate = Candidate { side, successor };
         let we_elect = ours < daemon;
-        if we_elect && current.is_some_and(|c| !new_wins(ours, daemon, c.candidate, candidate)) {
+        let stands_by = self.may_stand_by(&hello, beside, now);
+        let loses = |current: &LinkPeer| !new_wins(ours, daemon, current.candidate, candidate);
+        // A connection that was to stand by beside an earlier link does not become the link in use.
+        if we_elect && !stands_by && (beside.is_some() || current.is_some_and(loses)) {
             self.table.remove(number);
             // The dial did not fail: the peer is linked.
             self.dials.opened(number);
             self.close_connection(number, CloseCode::Duplicate, "another connection stands", now);
-            if side == Side::Client {
+            if side == Side::Client && beside.is_none() {
                 self.outbox.report(LinkReport::Up { daemon, address, proven });
             }
             return;
@@ -121,7 +127,7 @@ impl Links {
         let Some(connection) = self.connections.get_mut(number) else { return };
         connection.control.charge_to(&account);
         let Some(link) = self.table.get_mut(number) else { return };
-        link.place = None;
+        (link.place, link.beside) = (None, beside);
         link.phase = LinkPhase::Electing(now + ELECTION_TIMEOUT);
         link.peer = Some(LinkPeer {
             summary: EstablishedPeer { hello, negotiated, who },
@@ -138,9 +144,10 @@ impl Links {
             chain,
             silence: LinkSilence::new(side, now),
         });
-        if we_elect {
-            let elected = Elected { link: self.random.random(), election: self.next_election };
-            self.next_election += 1;
+        if we_elect && stands_by {
+            self.elect_standby(number, now);
+        } else if we_elect {
+            let elected = self.next_elected(None, None);
             self.send(number, &LinkMessage::Elected(elected), now);
             if let Some(peer) = self.table.peer_mut(number) {
                 peer.order.elected();
@@ -148,6 +155,18 @@ impl Links {
             self.open(number, elected, now);
         }
         self.connections.touch(number);
+    }
+
+    /// Returns the next election, of the `link` with this name or of one with a new name.
+    pub(super) fn next_elected(
+        &mut self,
+        link: Option<[u8; 16]>,
+        standby: Option<bool>,
+    ) -> Elected {
+        let link = link.unwrap_or_else(|| self.random.random());
+        let election = self.next_election;
+        self.next_election += 1;
+        Elected { link, election, standby }
     }
 
     fn turn_away(&mut self, number: u64, hello: &LinkHello, why: String, now: Duration) {
@@ -216,7 +235,10 @@ impl Links {
         let side = link.side;
         let Some(peer) = &mut link.peer else { return };
         peer.elected = Some(elected);
-        if let Some(age) = age {
+        // The keys of a link that stood by have their age.
+        if let Some(age) = age
+            && peer.age.until().is_none()
+        {
             peer.age = Age::new(age, side == Side::Client, now);
         }
         link.phase = LinkPhase::Open;
@@ -246,6 +268,7 @@ impl Links {
         self.send_receive_limits(number, now);
         self.dials.opened(number);
         self.table.put_in_use(daemon, number);
+        self.handle_in_use(daemon, number, now);
         let closed = current.and_then(|old| self.hand_over(old, now));
         self.outbox.event(LinkEvent::Up { number, daemon, old: current, closed });
         if let Some(connection) = self.connections.get(number) {
@@ -261,7 +284,7 @@ impl Links {
     ///
     /// # Errors
     /// The id belongs to another peer.
-    fn claim(
+    pub(super) fn claim(
         &mut self,
         daemon: DaemonId,
         who: &PeerIdentity,
@@ -327,6 +350,10 @@ impl Links {
         let Some(peer) = self.table.peer_mut(number) else { return };
         match peer.age.handle_timeout(now) {
             Some(AgeStep::End) => {
+                let daemon = peer.summary.hello.daemon;
+                if self.replace_by_standby(daemon, now) {
+                    return;
+                }
                 let text = "AXON_QKD_SESSION_MAX_AGE is reached and no successor came";
                 self.close_connection(number, CloseCode::KeySupply, text, now);
                 return self.end_link(number, text, None, now);
@@ -351,6 +378,7 @@ impl Links {
             listed: false,
             standing: None,
             replaces: peer.elected.map(|elected| elected.link),
+            beside: None,
         };
         self.dial(target, now);
     }

@@ -46,7 +46,10 @@ impl Links {
                 opening.handle_lost(now, reason, self.keyring.as_mut());
                 self.go_on_opening(number, now);
             }
-            LinkPhase::Electing(_) | LinkPhase::Open | LinkPhase::Leaving(_) => {
+            LinkPhase::Electing(_)
+            | LinkPhase::Standby
+            | LinkPhase::Open
+            | LinkPhase::Leaving(_) => {
                 let refusal = Refusal::of(reason);
                 let text = refusal.to_string();
                 // A stateless reset means that another daemon has the peer's port.
@@ -160,9 +163,11 @@ impl Links {
         self.nonces.retain(|_, link| *link != number);
         let Some(daemon) = daemon else { return };
         if !self.table.let_go(daemon, number) {
+            self.handle_standby_ended(number, daemon, now);
             return self.outbox.event(LinkEvent::Gone(number, daemon));
         }
         self.abandon_leaving(daemon, now);
+        self.forget_paths(daemon, now);
         tracing::info!(peer = %daemon, reason, "link down");
         if let Some(refusal) = refusal.filter(|refusal| refusal.by == RefusedBy::Peer)
             && !["GOODBYE", "DUPLICATE", "REPLACED"].contains(&refusal.name.as_str())

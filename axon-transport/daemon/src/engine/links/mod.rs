@@ -16,6 +16,7 @@ mod inbox;
 mod keys;
 mod link;
 mod opening;
+mod paths;
 mod silence;
 mod table;
 mod unfinished;
@@ -46,6 +47,7 @@ use self::{
     events::LinkOutbox,
     inbox::DiscoveryInbox,
     link::{Link, LinkPhase, view::LinkView},
+    paths::PeerPaths,
     silence::{CheckSchedule, Nonce, frames_came},
     table::LinkTable,
     unfinished::UnfinishedConnections,
@@ -97,6 +99,7 @@ pub(super) struct Links {
     inbox: DiscoveryInbox,
     outbox: LinkOutbox,
     looks: CheckSchedule,
+    paths: PeerPaths,
 }
 
 /// Returns the wall-clock time.
@@ -164,6 +167,7 @@ impl Links {
             inbox: DiscoveryInbox::new(),
             outbox: LinkOutbox::default(),
             looks: CheckSchedule::new(),
+            paths: PeerPaths::default(),
         })
     }
 
@@ -188,7 +192,7 @@ impl Links {
         bytes: BytesMut,
     ) {
         if bytes.first().is_some_and(|first| is_discovery(*first)) {
-            return self.handle_discovery(now, from, bytes);
+            return self.handle_discovery(now, from, local, bytes);
         }
         if let Some(keyring) = &self.keyring {
             keyring.set_time(now);
@@ -373,10 +377,8 @@ impl Links {
         }
         let daemon = peer.summary.hello.daemon;
         match message {
-            LinkMessage::Elected(elected) => {
-                peer.order.elected();
-                self.open(number, elected, now);
-            }
+            LinkMessage::Elected(elected) => self.handle_elected(number, elected, now),
+            LinkMessage::SwitchOver => self.handle_switch_over(number, daemon, now),
             LinkMessage::Keys(keys) => {
                 let Some(keyring) = self.keyring.as_mut().filter(|_| peer.seals) else { return };
                 if let Err(error) = keyring.handle_message(now, number, &keys) {
@@ -469,6 +471,7 @@ impl Links {
             keys,
             look,
             self.inbox.poll_timeout(),
+            self.paths_timeout(),
         ];
         parts.into_iter().flatten().min()
     }
@@ -488,6 +491,7 @@ impl Links {
             self.look_for_silence(now);
             self.widen_all(now);
         }
+        self.look_at_paths(now);
     }
 
     fn link_timeout(&mut self, number: u64, now: Duration) {
@@ -515,6 +519,7 @@ impl Links {
             }
             LinkPhase::Leaving(_) => self.leaving_timeout(number, now),
             LinkPhase::Electing(_) => {}
+            LinkPhase::Standby => self.standby_timeout(number, now),
             LinkPhase::Open => self.open_timeout(number, now),
         }
     }

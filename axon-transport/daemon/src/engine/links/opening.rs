@@ -223,7 +223,8 @@ impl Links {
                     Ok(number) => {
                         *connection = Some(number);
                         let mut link = Link::new(Side::Client, Duration::MAX, Some(dial));
-                        link.replaces = dialling.target().replaces;
+                        let DialTarget { daemon, replaces, beside, .. } = *dialling.target();
+                        (link.expected, link.replaces, link.beside) = (daemon, replaces, beside);
                         self.table.insert(number, link);
                     }
                     Err(error) => dialling.handle_unreachable(error.as_ref()),
@@ -249,6 +250,13 @@ impl Links {
                     self.table.remove(number);
                     self.close_connection(number, CloseCode::Duplicate, why, now);
                     return self.outbox.report(LinkReport::DialFailed { daemon, standing });
+                }
+                let current = target.daemon.and_then(|daemon| self.table.current_peer(daemon));
+                let in_use = current.and_then(|peer| Some(peer.elected?.link));
+                if target.beside.is_some() && target.beside != in_use {
+                    let why = "the link beside which it was to stand by is not in use any more";
+                    self.table.remove(number);
+                    return self.close_connection(number, CloseCode::Duplicate, why, now);
                 }
                 let hello = target.hello(&self.hello);
                 let sae = target.sae.clone();

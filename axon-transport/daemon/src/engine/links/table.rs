@@ -1,4 +1,4 @@
-//! The links by number, and the link in use of each peer.
+//! The links by number, and of each peer the link in use and the link that stands by.
 
 use std::{collections::HashMap, time::Duration};
 
@@ -15,6 +15,8 @@ use crate::engine::link::opening::Opening;
 pub(super) struct LinkTable {
     links: HashMap<u64, Link>,
     current: HashMap<DaemonId, u64>,
+    /// The link of a peer that stands by.
+    standby: HashMap<DaemonId, u64>,
 }
 
 impl LinkTable {
@@ -86,9 +88,19 @@ impl LinkTable {
         self.iter().filter_map(|(number, link)| Some((number, link.peer.as_ref()?)))
     }
 
-    /// Returns the number of links of one identity.
+    /// Returns the number of links that do not stand by.
+    pub(super) fn in_use_count(&self) -> usize {
+        self.beside_standby().count()
+    }
+
+    /// Returns the number of links of one identity that do not stand by.
     pub(super) fn of_identity(&self, who: &PeerIdentity) -> usize {
-        self.peers().filter(|(_, peer)| peer.summary.who.is(who)).count()
+        self.beside_standby().filter(|peer| peer.summary.who.is(who)).count()
+    }
+
+    fn beside_standby(&self) -> impl Iterator<Item = &LinkPeer> {
+        let links = self.links.values().filter(|link| !matches!(link.phase, LinkPhase::Standby));
+        links.filter_map(|link| link.peer.as_ref())
     }
 
     /// Returns the links that carry samples.
@@ -125,6 +137,26 @@ impl LinkTable {
             self.current.remove(&daemon);
         }
         was
+    }
+
+    /// Returns the link of a peer that stands by.
+    pub(super) fn standby(&self, daemon: DaemonId) -> Option<u64> {
+        self.standby.get(&daemon).copied()
+    }
+
+    /// Returns the number of links that stand by.
+    pub(super) fn standby_count(&self) -> usize {
+        self.standby.len()
+    }
+
+    /// Sets the link of a peer that stands by. Returns the earlier one.
+    pub(super) fn set_standby(&mut self, daemon: DaemonId, number: u64) -> Option<u64> {
+        self.standby.insert(daemon, number)
+    }
+
+    /// Takes the link of a peer that stands by out of this role.
+    pub(super) fn take_standby(&mut self, daemon: DaemonId) -> Option<u64> {
+        self.standby.remove(&daemon)
     }
 
     /// Returns when the first link has an action due.

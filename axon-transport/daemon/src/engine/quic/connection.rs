@@ -10,7 +10,11 @@ use axon_transport::status::LinkStatus;
 use quinn_proto::{ConnectionHandle, StreamId, Transmit};
 use rustls_pki_types::CertificateDer;
 
-use super::{control_stream::ControlStream, link_rate::LinkRate};
+use super::{
+    answers::{AnswerWatch, Exchange},
+    control_stream::ControlStream,
+    link_rate::LinkRate,
+};
 use crate::{
     engine::{
         congestion::marks::marks_reported,
@@ -71,6 +75,8 @@ pub(crate) struct Connection {
     pub(in crate::engine) deadline: Option<std::time::Instant>,
     /// The number of datagrams that arrived with an ECN mark.
     pub(in crate::engine) ecn_marks: u64,
+    /// Since when the peer has not answered, while a second link stands by.
+    pub(in crate::engine) watch: Option<AnswerWatch>,
 }
 
 impl Connection {
@@ -94,6 +100,7 @@ impl Connection {
             is_transmitting: false,
             deadline: None,
             ecn_marks: 0,
+            watch: None,
         }
     }
 
@@ -111,6 +118,11 @@ impl Connection {
             self.limit_interface(limits);
             limits.handle_address();
         }
+    }
+
+    /// Returns the address of this host that packets leave from, if it is known.
+    pub(in crate::engine) fn local(&self) -> Option<IpAddr> {
+        self.local
     }
 
     /// Applies the limits of the interface that packets leave by.
@@ -157,7 +169,10 @@ impl Connection {
     }
 
     /// Counts packets that leave, with their headers of IP and UDP.
-    pub(in crate::engine) fn count_sent(&self, transmit: &Transmit, now: Duration) {
+    pub(in crate::engine) fn count_sent(&mut self, transmit: &Transmit, now: Duration) {
+        if let Some(watch) = &mut self.watch {
+            watch.handle_sent(|| Exchange::from(&self.quic.stats()), now);
+        }
         let each = transmit.segment_size.unwrap_or(transmit.size).max(1);
         let packets = transmit.size.div_ceil(each) as u64;
         let headers = if transmit.destination.is_ipv4() { 28 } else { 48 };

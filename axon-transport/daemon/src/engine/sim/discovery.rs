@@ -25,6 +25,10 @@ pub(super) struct SimDiscovery {
     daemon: DaemonId,
     peers: BTreeMap<DaemonId, Peer>,
     links: BTreeMap<DaemonId, Linked>,
+    /// All addresses of peers that have several.
+    addresses: BTreeMap<DaemonId, Vec<SocketAddr>>,
+    /// Orders for the gateway.
+    orders: Vec<ToGateway>,
     /// When dials began.
     dialled: VecDeque<Duration>,
 }
@@ -48,6 +52,7 @@ impl SimDiscovery {
     pub(super) fn start(&mut self, daemon: DaemonId, now: Duration) {
         self.daemon = daemon;
         self.links.clear();
+        self.orders.clear();
         self.peers.values_mut().for_each(|peer| peer.dial_at = Some(now));
     }
 
@@ -78,6 +83,14 @@ impl SimDiscovery {
         self.peers.remove(&daemon);
     }
 
+    /// Beacons came from these addresses of a peer.
+    pub(super) fn hear_addresses(&mut self, daemon: DaemonId, addresses: Vec<SocketAddr>) {
+        if self.links.contains_key(&daemon) {
+            self.orders.push(ToGateway::Addresses { daemon, addresses: addresses.clone() });
+        }
+        self.addresses.insert(daemon, addresses);
+    }
+
     /// A peer has another address.
     pub(super) fn set_address(&mut self, daemon: DaemonId, address: SocketAddr) {
         let Some(peer) = self.peers.get_mut(&daemon) else { return };
@@ -90,6 +103,9 @@ impl SimDiscovery {
     /// A link stands there.
     pub(super) fn handle_link_up(&mut self, daemon: DaemonId, address: SocketAddr) {
         self.links.insert(daemon, Linked { address, cut: false });
+        if let Some(addresses) = self.addresses.get(&daemon).cloned() {
+            self.orders.push(ToGateway::Addresses { daemon, addresses });
+        }
     }
 
     /// The path of a link works, or does not.
@@ -117,10 +133,11 @@ impl SimDiscovery {
 
     /// When a dial is due.
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
-        self.looked_for().filter_map(|(_, peer)| peer.dial_at).min()
+        let ordered = (!self.orders.is_empty()).then_some(Duration::ZERO);
+        self.looked_for().filter_map(|(_, peer)| peer.dial_at).chain(ordered).min()
     }
 
-    /// The dials that are due.
+    /// The dials that are due, and other orders.
     pub(super) fn take_due(&mut self, now: Duration) -> Vec<ToGateway> {
         let due = self.looked_for().filter(|(_, peer)| peer.dial_at.is_some_and(|at| at <= now));
         let due: Vec<_> = due.map(|(daemon, _)| *daemon).collect();
@@ -132,7 +149,8 @@ impl SimDiscovery {
             let standing = AddressConfidence::Heard;
             Some(ToGateway::Dial { daemon, sae, addresses, listed: false, standing })
         });
-        dials.collect()
+        let dials: Vec<_> = dials.collect();
+        self.orders.drain(..).chain(dials).collect()
     }
 
     /// Dials that may be under way, those of successors included.

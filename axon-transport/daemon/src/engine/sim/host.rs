@@ -54,6 +54,8 @@ const COMPRESSOR: f64 = 300e6;
 pub(super) struct Host {
     pub(super) number: usize,
     pub(super) address: Ipv4Addr,
+    /// The address of the second interface, if it has one.
+    pub(super) second: Option<Ipv4Addr>,
     pub(super) daemon: DaemonId,
     /// The daemon whose id the next one of this host claims.
     pub(super) poses_as: Option<DaemonId>,
@@ -99,6 +101,7 @@ impl Host {
         Self {
             number,
             address: Ipv4Addr::new(10, 0, high, low),
+            second: None,
             daemon: DaemonId::default(),
             poses_as: None,
             rings: SimRings::new(number),
@@ -304,6 +307,13 @@ impl Host {
         }
     }
 
+    /// Discovery heard of the addresses of a peer.
+    pub(super) fn hear_addresses(&mut self, daemon: DaemonId, addresses: &[Ipv4Addr]) {
+        self.due.set(None);
+        let addresses = addresses.iter().map(|a| SocketAddr::from((*a, PORT))).collect();
+        self.discovery.hear_addresses(daemon, addresses);
+    }
+
     /// A peer has another address.
     pub(super) fn moved(&mut self, daemon: DaemonId, address: Ipv4Addr) {
         self.due.set(None);
@@ -353,13 +363,13 @@ impl Host {
         &mut self,
         now: Duration,
         from: SocketAddr,
+        to: IpAddr,
         ecn: Option<EcnCodepoint>,
         bytes: BytesMut,
     ) {
         self.due.set(None);
         if let Some(engine) = &mut self.engine {
-            let local = Some(IpAddr::V4(self.address));
-            engine.handle_datagram(now, 0, from, local, ecn, bytes);
+            engine.handle_datagram(now, 0, from, Some(to), ecn, bytes);
         }
     }
 

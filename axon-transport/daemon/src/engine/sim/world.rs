@@ -3,7 +3,8 @@
 use std::{
     collections::{BTreeMap, BTreeSet},
     fmt::Write,
-    net::SocketAddr,
+    iter,
+    net::{IpAddr, Ipv4Addr, SocketAddr},
     time::{Duration, Instant},
 };
 
@@ -24,6 +25,13 @@ use crate::{engine::keyring::tests::Kmes, keys::KmeAnswer};
 
 /// A KME answers after this time.
 const KME: Duration = Duration::from_millis(20);
+
+/// The second byte of the addresses of second interfaces.
+const SECOND_NETWORK: u8 = 200;
+
+fn is_second(address: IpAddr) -> bool {
+    matches!(address.to_canonical(), IpAddr::V4(v4) if v4.octets()[1] == SECOND_NETWORK)
+}
 
 /// An endpoint, and its host.
 type HostEndpoint = (usize, Gid);
@@ -100,6 +108,27 @@ impl World {
         self.hosts[host].want(daemon, address, sae, self.now);
     }
 
+    /// Gives a host a second interface, in another network.
+    pub(super) fn add_second_interface(&mut self, host: usize) -> Ipv4Addr {
+        let [_, _, high, low] = self.hosts[host].address.octets();
+        let second = Ipv4Addr::new(10, SECOND_NETWORK, high, low);
+        self.network.add_interface(host, second, 1);
+        self.hosts[host].second = Some(second);
+        second
+    }
+
+    /// Has each host hear the beacons of all others, from all their addresses.
+    pub(super) fn hear_all_addresses(&mut self) {
+        for host in 0..self.hosts.len() {
+            for other in (0..self.hosts.len()).filter(|other| *other != host) {
+                let peer = &self.hosts[other];
+                let (daemon, first) = (peer.daemon, peer.address);
+                let addresses: Vec<_> = iter::once(first).chain(peer.second).collect();
+                self.hosts[host].hear_addresses(daemon, &addresses);
+            }
+        }
+    }
+
     /// Adds a peer that a test speaks for. Returns its number among those.
     pub(super) fn add_raw(&mut self, config: Config, daemon: DaemonId) -> usize {
         let host = self.hosts.len() + self.raws.len();
@@ -157,7 +186,7 @@ impl World {
     /// Gives a host another address, which the others learn.
     pub(super) fn move_host(&mut self, host: usize) {
         let [_, subnet, high, low] = self.hosts[host].address.octets();
-        let address = std::net::Ipv4Addr::new(10, subnet.wrapping_add(1), high, low);
+        let address = Ipv4Addr::new(10, subnet.wrapping_add(1), high, low);
         self.network.move_host(self.hosts[host].address, address);
         self.hosts[host].address = address;
         let daemon = self.hosts[host].daemon;
@@ -319,7 +348,10 @@ impl World {
             }
             let bytes = BytesMut::from(delivery.bytes);
             match self.hosts.get_mut(delivery.host) {
-                Some(host) => host.handle_datagram(now, delivery.from, delivery.ecn, bytes),
+                Some(host) => {
+                    let to = delivery.at.ip();
+                    host.handle_datagram(now, delivery.from, to, delivery.ecn, bytes);
+                }
                 None => {
                     let raw = &mut self.raws[delivery.host - self.hosts.len()];
                     raw.handle_datagram(now, delivery.from, delivery.ecn, bytes);
@@ -367,10 +399,13 @@ impl World {
     fn transmit(&mut self, number: usize) {
         let now = self.now;
         let host = &mut self.hosts[number];
-        let from = SocketAddr::from((host.address, PORT));
+        let (first, second) = (host.address, host.second);
         let mut buffer = Vec::new();
         while let Some(transmit) = host.poll_transmit(&mut buffer, now) {
             let (to, bytes) = (transmit.destination, &buffer[..transmit.size]);
+            // The routing table sends to each network through the interface that is in it.
+            let from = second.filter(|_| is_second(to.ip())).unwrap_or(first);
+            let from = SocketAddr::from((from, PORT));
             self.network.send(now, from, to, transmit.ecn, bytes, transmit.segment_size);
         }
     }

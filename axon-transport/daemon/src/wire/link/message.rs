@@ -68,6 +68,12 @@ pub struct LinkHello {
     /// The proof of the sender's id for this connection. Earlier versions send none.
     #[n(19)]
     pub proof: Option<DaemonProof>,
+    /// Maximum number of links with one peer at a time that the sender supports; absent: 1.
+    #[n(20)]
+    pub paths: Option<u8>,
+    /// The link in use beside which this connection stands by, over another path.
+    #[cbor(n(21), with = "minicbor::bytes")]
+    pub beside: Option<[u8; 16]>,
 }
 
 /// The connection that the daemon with the lower id keeps.
@@ -81,6 +87,10 @@ pub struct Elected {
     /// read last.
     #[n(1)]
     pub election: u64,
+    /// True if the connection stands by: the link in use stays in use. A second ELECTED on the connection, without this
+    /// key, puts it in use.
+    #[n(2)]
+    pub standby: Option<bool>,
 }
 
 /// The sender has closed a superseded link that was silent, and sends nothing over it any more.
@@ -423,6 +433,8 @@ pub enum LinkMessage {
     AccessCheck(LinkAccessCheck),
     /// The answer to ACCESS_CHECK.
     AccessDecisions(AccessDecisions),
+    /// A request to put the link that stands by in use: the link in use does not answer the sender.
+    SwitchOver,
     /// A message about keys.
     Keys(KeyMessage),
 }
@@ -449,6 +461,7 @@ impl LinkMessage {
             Self::Denied(m) => (20, to_map(m)),
             Self::AccessCheck(m) => (21, to_map(m)),
             Self::AccessDecisions(m) => (22, to_map(m)),
+            Self::SwitchOver => (23, to_map(&NoContent {})),
             Self::Keys(m) => {
                 let mut map = Vec::new();
                 m.encode(&mut map);
@@ -459,7 +472,7 @@ impl LinkMessage {
 
     /// Returns whether [`decode`](Self::decode) knows this type.
     pub(super) fn is_known(kind: u8) -> bool {
-        matches!(kind, 1..=22)
+        matches!(kind, 1..=23)
     }
 
     /// Decodes the message of type `kind`; returns `None` for an unknown type.
@@ -487,6 +500,7 @@ impl LinkMessage {
             20 => Self::Denied(from_map(kind, map)?),
             21 => Self::AccessCheck(from_map(kind, map)?),
             22 => Self::AccessDecisions(from_map(kind, map)?),
+            23 => from_map::<NoContent>(kind, map).map(|_| Self::SwitchOver)?,
             _ => return Ok(None),
         };
         match message.bounds() {
@@ -562,6 +576,7 @@ impl LinkMessage {
             | Self::Unsubscribe(_)
             | Self::Keepalive
             | Self::ReceiveLimits(_)
+            | Self::SwitchOver
             | Self::LinkClosed(_) => Ok(()),
             // The decoder of key messages checks their limits.
             Self::Keys(_) => Ok(()),

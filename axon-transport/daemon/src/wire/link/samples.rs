@@ -32,6 +32,8 @@ pub(crate) fn hello() -> LinkHello {
         static_peer: false,
         routes: None,
         proof: None,
+        paths: None,
+        beside: None,
     }
 }
 
@@ -40,7 +42,7 @@ pub(crate) fn peer() -> LinkHello {
 }
 
 pub(crate) fn elected() -> LinkMessage {
-    LinkMessage::Elected(Elected { link: [9; 16], election: 3 })
+    LinkMessage::Elected(Elected { link: [9; 16], election: 3, standby: None })
 }
 
 /// Returns example messages, HELLO first.
@@ -50,10 +52,14 @@ pub(crate) fn messages() -> Vec<LinkMessage> {
         LinkMessage::Hello(LinkHello {
             replaces: Some([3; 16]),
             expects: Some(DaemonId([4; 16])),
+            paths: Some(2),
+            beside: Some([8; 16]),
             proof: Some(DaemonProof { key: [5; 32], signature: [6; 64] }),
             ..hello()
         }),
         elected(),
+        LinkMessage::Elected(Elected { link: [9; 16], election: 4, standby: Some(true) }),
+        LinkMessage::SwitchOver,
         LinkMessage::Graph(GraphUpdate {
             version: 2,
             before: 1,

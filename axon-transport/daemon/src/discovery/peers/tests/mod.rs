@@ -37,6 +37,7 @@ pub(super) fn local() -> LocalDaemon {
         range: DiscoveryRange::Subnet,
         bind: vec!["10.0.0.1".parse().unwrap()],
         advertise: Vec::new(),
+        has_two_paths: false,
     }
 }
 

@@ -65,6 +65,7 @@ impl Subnet {
                 range: DiscoveryRange::Subnet,
                 bind: vec![ip],
                 advertise: Vec::new(),
+                has_two_paths: false,
             };
             Host {
                 peers: PeerDiscovery::new(local, seed ^ host as u64),
@@ -169,6 +170,9 @@ impl Subnet {
                 }
                 PeersOutput::Action(DiscoveryAction::Named(names)) => {
                     panic!("it looks no names up: {names:?}")
+                }
+                PeersOutput::Action(DiscoveryAction::Addresses { .. }) => {
+                    panic!("links have one path")
                 }
                 // Many consecutive beacons were lost, so the peer seemed gone; its mismatch is reported again.
                 PeersOutput::Action(DiscoveryAction::Gone { daemon }) => {

@@ -28,6 +28,7 @@ fn target(sae: Option<&str>, addresses: u8) -> DialTarget {
         listed: false,
         standing: None,
         replaces: None,
+        beside: None,
     }
 }
 

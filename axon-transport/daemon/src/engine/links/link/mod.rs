@@ -10,6 +10,7 @@ use std::{
     time::{Duration, SystemTime},
 };
 
+use axon_shm::ids::DaemonId;
 use axon_tls::Negotiated;
 use axon_transport::status::LinkStatus;
 use rustls_pki_types::CertificateDer;
@@ -34,6 +35,8 @@ pub(super) enum LinkPhase {
     Opening(Box<Opening>),
     /// It waits for its election, until this time.
     Electing(Duration),
+    /// It stands by beside the link in use, over another path, and carries nothing.
+    Standby,
     /// It carries samples.
     Open,
     /// A successor took over: the link delivers its data in flight.
@@ -46,6 +49,10 @@ pub(super) struct Link {
     pub(super) phase: LinkPhase,
     /// The link that it replaces, as its dialler stated.
     pub(super) replaces: Option<[u8; 16]>,
+    /// The daemon that was dialled.
+    pub(super) expected: Option<DaemonId>,
+    /// The link in use beside which it is to stand by, as its dialler stated.
+    pub(super) beside: Option<[u8; 16]>,
     /// The peer, once HELLO was checked and its name proven.
     pub(super) peer: Option<LinkPeer>,
     /// The place of its handshake among those under way.
@@ -110,6 +117,8 @@ impl Link {
             side,
             phase: LinkPhase::Handshake(until, dial),
             replaces: None,
+            expected: None,
+            beside: None,
             peer: None,
             place: None,
             resolver: None,
@@ -122,11 +131,12 @@ impl Link {
             LinkPhase::Handshake(until, dial) => dial.is_none().then_some(*until),
             LinkPhase::Opening(opening) => opening.poll_timeout(),
             LinkPhase::Electing(until) => Some(*until),
-            LinkPhase::Open => None,
+            LinkPhase::Standby | LinkPhase::Open => None,
             LinkPhase::Leaving(leaving) => leaving.poll_timeout(),
         };
         let peer = self.peer.as_ref();
-        let age = peer.filter(|_| self.is_open()).and_then(|peer| peer.age.poll_timeout());
+        let ages = matches!(self.phase, LinkPhase::Standby | LinkPhase::Open);
+        let age = peer.filter(|_| ages).and_then(|peer| peer.age.poll_timeout());
         let probe = peer.and_then(|peer| peer.silence.poll_timeout());
         [phase, age, probe].into_iter().flatten().min()
     }

@@ -4,7 +4,10 @@ mod prober;
 mod schedule;
 mod watch;
 
-use std::{net::SocketAddr, time::Duration};
+use std::{
+    net::{IpAddr, SocketAddr},
+    time::Duration,
+};
 
 use bytes::BytesMut;
 use rand::RngExt;
@@ -25,12 +28,24 @@ const MAX_DISCOVERY: usize = 512;
 
 impl Links {
     /// Handles a discovery datagram, or the echo of a probe.
-    pub(super) fn handle_discovery(&mut self, now: Duration, from: SocketAddr, bytes: BytesMut) {
+    pub(super) fn handle_discovery(
+        &mut self,
+        now: Duration,
+        from: SocketAddr,
+        local: Option<IpAddr>,
+        bytes: BytesMut,
+    ) {
         if bytes.len() > MAX_DISCOVERY {
             return;
         }
-        if !self.nonces.is_empty()
-            && let Ok(Datagram::Echo { nonce, daemon }) = Datagram::decode(&bytes)
+        let echo = match !self.nonces.is_empty() || self.probes_paths() {
+            true => Datagram::decode(&bytes).ok(),
+            false => None,
+        };
+        if let Some(Datagram::Echo { nonce, daemon }) = echo {
+            self.handle_path_echo(now, (from, local), daemon, nonce);
+        }
+        if let Some(Datagram::Echo { nonce, daemon }) = echo
             && let Some(number) = self.nonces.get(&nonce).copied()
         {
             // An answer of another daemon at the address does not show the path to this one.
@@ -57,9 +72,11 @@ impl Links {
             return;
         };
         let traffic = Traffic::from(&connection.quic.stats());
+        let daemon = peer.summary.hello.daemon;
         if peer.silence.handle_heard(now, traffic) {
-            self.outbox.event(LinkEvent::Back(peer.summary.hello.daemon));
+            self.outbox.event(LinkEvent::Back(daemon));
         }
+        self.note_answers(number, daemon);
     }
 
     /// Probes the path of links over which something was sent and nothing arrived in the last second. Peers from which

@@ -141,6 +141,11 @@ impl LinkSilence {
         self.probing.as_ref().is_some_and(cut)
     }
 
+    /// Handles that another path takes over, because this one does not answer.
+    pub(in crate::engine::links) fn handle_failover(&mut self, traffic: Traffic) {
+        (self.silent, self.traffic, self.probing) = (true, traffic, None);
+    }
+
     /// Handles that a successor took over. Returns whether the link is silent.
     pub(in crate::engine::links) fn handle_superseded(&mut self, traffic: Traffic) -> bool {
         self.silent &= !traffic.answered_since(self.traffic);
@@ -352,6 +357,18 @@ mod tests {
         assert!(silence.handle_second_superseded(second(7)));
         assert!(!silence.handle_second_superseded(second(8)), "once");
         assert!(silence.is_silent());
+    }
+
+    #[test]
+    fn path_that_another_one_replaces_is_silent_though_it_answered_in_this_second() {
+        let mut silence = LinkSilence::new(Side::Client, START);
+        silence.handle_second(second(1), traffic(1, 1, 1), || NONCE);
+        let now = traffic(5, 5, 9);
+        silence.handle_heard(second(1), now);
+        silence.handle_failover(now);
+        assert!(silence.handle_superseded(now));
+        silence.handle_failover(now);
+        assert!(!silence.handle_superseded(traffic(6, 6, 9)), "it answers after all");
     }
 
     #[test]

@@ -73,7 +73,7 @@ pub(super) fn say(world: &mut World, on: usize, message: &LinkMessage) {
 }
 
 pub(super) fn elect(election: u64) -> LinkMessage {
-    LinkMessage::Elected(Elected { link: [election as u8; 16], election })
+    LinkMessage::Elected(Elected { link: [election as u8; 16], election, standby: None })
 }
 
 pub(super) fn subscribe(route: u32, topic: &str, qos: Qos) -> LinkMessage {

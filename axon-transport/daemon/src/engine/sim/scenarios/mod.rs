@@ -9,6 +9,7 @@ mod long;
 mod losses;
 mod memory;
 mod moves;
+mod paths;
 mod priorities;
 mod radio;
 mod refused;

@@ -93,7 +93,9 @@ impl Torture {
                     _ => {}
                 }
             }
-            LinkMessage::Elected(m) => *m = Elected { link: gid.0, election: number },
+            LinkMessage::Elected(m) => {
+                *m = Elected { link: gid.0, election: number, standby: None }
+            }
             LinkMessage::Graph(m) => {
                 (m.version, m.before) = (self.number(), if number == 1 { 0 } else { number });
                 m.more = self.rng.random_bool(0.2);
@@ -275,7 +277,11 @@ fn honest(raw: &mut Raw, on: usize, greeted: bool) {
     }
     let hello = LinkHello { replaces: Some([1; 16]), ..raw.hello() };
     match raw.daemon {
-        LOWEST => raw.links[on].say(&LinkMessage::Elected(Elected { link: [1; 16], election: 1 })),
+        LOWEST => raw.links[on].say(&LinkMessage::Elected(Elected {
+            link: [1; 16],
+            election: 1,
+            standby: None,
+        })),
         _ => raw.links[on].say(&LinkMessage::Hello(hello)),
     }
 }

@@ -1,0 +1,428 @@
+//! Two paths to a peer: a second link stands by at another address of the peer, and takes over when the path of the
+//! link in use does not answer.
+
+mod failover;
+mod search;
+
+use std::{
+    collections::HashMap,
+    net::{IpAddr, SocketAddr},
+    time::Duration,
+};
+
+use axon_shm::ids::DaemonId;
+use axon_transport::status::StandbyStatus;
+use rand::RngExt;
+
+use self::{
+    failover::{Failover, FailoverStep},
+    search::{PathSearch, is_other},
+};
+use super::{
+    Links,
+    election::OTHERS,
+    link::{
+        LinkPhase,
+        age::{Age, AgeStep},
+    },
+    silence::{Nonce, Traffic},
+};
+use crate::{
+    engine::{
+        link::target::DialTarget,
+        links::LinkEvent,
+        quic::{
+            answers::{AnswerWatch, Exchange},
+            connection::Connection,
+        },
+    },
+    link::{CloseCode, Elected, LinkHello, LinkMessage, Side},
+    wire::beacon::Datagram,
+};
+
+/// Maximum number of links that stand by, of all peers.
+const MAX_STANDBY: usize = 64;
+/// Time since its last packet after which another link may replace one that stands by.
+const STANDBY_SILENT: Duration = Duration::from_secs(15);
+
+/// The paths to the peers that may have two links at a time.
+#[derive(Default)]
+pub(super) struct PeerPaths {
+    all: HashMap<DaemonId, Paths>,
+}
+
+/// The paths to one peer.
+struct Paths {
+    search: PathSearch,
+    failover: Failover,
+}
+
+impl Links {
+    /// Returns whether this host and the peer support a second link at a time.
+    fn has_two_paths(&self, hello: &LinkHello) -> bool {
+        self.config.link.paths > 1 && hello.paths.is_some_and(|paths| paths > 1)
+    }
+
+    /// Returns whether a connection may stand by: `beside` names the link in use, as the dialler's HELLO states.
+    fn is_beside(&self, hello: &LinkHello, beside: Option<[u8; 16]>) -> bool {
+        let current = self.table.current_peer(hello.daemon);
+        beside.is_some()
+            && self.has_two_paths(hello)
+            && current.is_some_and(|current| current.elected.map(|e| e.link) == beside)
+    }
+
+    /// Returns whether this side elects a connection to stand by.
+    pub(super) fn may_stand_by(
+        &self,
+        hello: &LinkHello,
+        beside: Option<[u8; 16]>,
+        now: Duration,
+    ) -> bool {
+        let standby = self.table.standby(hello.daemon).and_then(|number| self.table.peer(number));
+        let is_needed = standby.is_none_or(|peer| peer.silence.heard_at() + STANDBY_SILENT <= now);
+        let has_room = standby.is_some() || self.table.standby_count() < MAX_STANDBY;
+        is_needed && has_room && self.is_beside(hello, beside)
+    }
+
+    /// Elects a connection to stand by.
+    pub(super) fn elect_standby(&mut self, number: u64, now: Duration) {
+        let elected = self.next_elected(None, Some(true));
+        self.send(number, &LinkMessage::Elected(elected), now);
+        self.stand_by(number, elected, now);
+    }
+
+    /// Handles that a connection was elected to stand by.
+    fn stand_by(&mut self, number: u64, elected: Elected, now: Duration) {
+        let (Some(address), Some(link)) =
+            (self.connections.address(number), self.table.get(number))
+        else {
+            return;
+        };
+        let Some(peer) = &link.peer else { return };
+        let (daemon, beside, side) = (peer.summary.hello.daemon, link.beside, link.side);
+        let (who, proven) = (peer.summary.who.clone(), peer.proven);
+        if beside.is_none() {
+            let why = "ELECTED makes a link stand by that was not dialled for that";
+            return self.violation(number, CloseCode::OutOfOrder, why, now);
+        }
+        // Another host may have linked under the daemon's id since this connection's HELLO.
+        if let Err(why) = self.claim(daemon, &who, proven, now) {
+            return self.violation_told(number, CloseCode::NotAllowed, &why, OTHERS, now);
+        }
+        let is_beside =
+            self.table.peer(number).is_some_and(|p| self.is_beside(&p.summary.hello, beside));
+        let earlier = self.table.standby(daemon);
+        let elected_before = earlier.and_then(|earlier| self.table.peer(earlier)?.elected);
+        let is_older = elected_before.is_some_and(|before| before.election > elected.election);
+        if !is_beside || is_older {
+            // The link in use changed meanwhile, or messages on two connections overtook each other.
+            self.end_standby(number, "the link beside it changed", now);
+            return self.opening_failed(number);
+        }
+        let max_age = self.keyring.as_ref().map(|keyring| keyring.config.session_max_age);
+        let Some(link) = self.table.get_mut(number) else { return };
+        link.phase = LinkPhase::Standby;
+        if let Some(peer) = &mut link.peer {
+            peer.order.stands_by();
+            peer.elected = Some(elected);
+            if let Some(max_age) = max_age {
+                peer.age = Age::new(max_age, side == Side::Client, now);
+            }
+        }
+        self.dials.opened(number);
+        if let Some(earlier) = self.table.set_standby(daemon, number) {
+            self.end_standby(earlier, "another link stands by", now);
+        }
+        if let Some(paths) = self.paths.all.get_mut(&daemon) {
+            paths.search.handle_found(address);
+            paths.failover.handle_standby();
+        }
+        tracing::info!(peer = %daemon, %address, "a second link stands by");
+        self.connections.touch(number);
+    }
+
+    /// Handles that a link was put in use: looks for a second path if both hosts support one.
+    pub(super) fn handle_in_use(&mut self, daemon: DaemonId, number: u64, now: Duration) {
+        let Some(peer) = self.table.peer(number) else { return };
+        if !self.has_two_paths(&peer.summary.hello) {
+            return;
+        }
+        let elects = self.hello.daemon < daemon;
+        let exchange = self.exchange(number);
+        let paths = self.paths.all.entry(daemon).or_insert_with(|| Paths {
+            search: PathSearch::new(elects, now),
+            failover: Failover::default(),
+        });
+        paths.failover = Failover::new(exchange);
+        if let Some(connection) = self.connections.get_mut(number) {
+            connection.watch.get_or_insert_default().restart(exchange);
+        }
+        // The new link may have the path of the one that stands by.
+        let address = |number| self.connections.address(number);
+        if let Some(standby) = self.table.standby(daemon)
+            && let (Some(one), Some(other)) = (address(standby), address(number))
+            && !is_other(one, other)
+        {
+            self.handle_standby_ended(standby, daemon, now);
+            self.end_standby(standby, "the link in use has its path", now);
+        }
+    }
+
+    /// Handles the end of the link in use: the link that stands by ends with it.
+    pub(super) fn forget_paths(&mut self, daemon: DaemonId, now: Duration) {
+        self.paths.all.remove(&daemon);
+        if let Some(standby) = self.table.take_standby(daemon) {
+            self.end_standby(standby, "the link beside it ended", now);
+        }
+    }
+
+    /// Handles the end of a link if it stood by: another path is looked for.
+    pub(super) fn handle_standby_ended(&mut self, number: u64, daemon: DaemonId, now: Duration) {
+        if self.table.standby(daemon) != Some(number) {
+            return;
+        }
+        self.table.take_standby(daemon);
+        tracing::info!(peer = %daemon, "no second link stands by any more");
+        if let Some(paths) = self.paths.all.get_mut(&daemon) {
+            paths.search.handle_lost(now);
+        }
+    }
+
+    fn end_standby(&mut self, number: u64, why: &str, now: Duration) {
+        self.close_connection(number, CloseCode::Replaced, why, now);
+        if let Some(peer) = self.table.remove(number).and_then(|link| link.peer) {
+            self.outbox.event(LinkEvent::Gone(number, peer.summary.hello.daemon));
+        }
+    }
+
+    /// Handles the timer of a link that stands by: its keys are near their maximum age, so it ends, and another one is
+    /// dialled.
+    pub(super) fn standby_timeout(&mut self, number: u64, now: Duration) {
+        let Some(peer) = self.table.peer_mut(number) else { return };
+        let daemon = peer.summary.hello.daemon;
+        let Some(AgeStep::End | AgeStep::Renew) = peer.age.handle_timeout(now) else { return };
+        self.handle_standby_ended(number, daemon, now);
+        self.end_standby(number, "AXON_QKD_SESSION_MAX_AGE is near", now);
+    }
+
+    /// Handles the peer's request to put the link that stands by in use.
+    pub(super) fn handle_switch_over(&mut self, number: u64, daemon: DaemonId, now: Duration) {
+        if self.table.standby(daemon) == Some(number) {
+            self.put_standby_in_use(number, now);
+        }
+    }
+
+    /// Handles ELECTED for a link that stands by: it takes over from the link in use.
+    pub(super) fn handle_elected(&mut self, number: u64, elected: Elected, now: Duration) {
+        if elected.standby == Some(true) {
+            return self.stand_by(number, elected, now);
+        }
+        // [`open`](Self::open) refuses a link under another host's id.
+        if let Some(peer) = self.table.peer(number)
+            && let daemon = peer.summary.hello.daemon
+            && self.table.standby(daemon) == Some(number)
+            && let (who, proven) = (peer.summary.who.clone(), peer.proven)
+            && self.claim(daemon, &who, proven, now).is_ok()
+        {
+            self.give_up_silent(daemon);
+            self.table.take_standby(daemon);
+            if let Some(paths) = self.paths.all.get_mut(&daemon) {
+                paths.search.handle_lost(now);
+            }
+        }
+        if let Some(peer) = self.table.peer_mut(number) {
+            peer.order.elected();
+        }
+        self.open(number, elected, now);
+    }
+
+    /// Elects the link that stands by.
+    fn put_standby_in_use(&mut self, number: u64, now: Duration) {
+        let Some(before) = self.table.peer(number).and_then(|peer| peer.elected) else { return };
+        let elected = self.next_elected(Some(before.link), None);
+        self.send(number, &LinkMessage::Elected(elected), now);
+        self.handle_elected(number, elected, now);
+    }
+
+    /// Puts the link that stands by in use if this side elects, because the link in use ends. Returns whether it did.
+    pub(super) fn replace_by_standby(&mut self, daemon: DaemonId, now: Duration) -> bool {
+        let standby = self.table.standby(daemon).filter(|_| self.hello.daemon < daemon);
+        standby.into_iter().for_each(|standby| self.put_standby_in_use(standby, now));
+        standby.is_some()
+    }
+
+    /// Takes the link in use for silent: nothing is expected over it when another one takes over.
+    fn give_up_silent(&mut self, daemon: DaemonId) {
+        let Some(number) = self.table.current(daemon) else { return };
+        let (Some(connection), Some(peer)) =
+            (self.connections.get(number), self.table.peer_mut(number))
+        else {
+            return;
+        };
+        peer.silence.handle_failover(Traffic::from(&connection.quic.stats()));
+    }
+
+    fn exchange(&self, number: u64) -> Exchange {
+        let connection = self.connections.get(number);
+        connection.map(|c| Exchange::from(&c.quic.stats())).unwrap_or_default()
+    }
+
+    /// Records the answers of the peer of a link, whose connection had work.
+    pub(super) fn note_answers(&mut self, number: u64, daemon: DaemonId) {
+        if self.table.current(daemon) == Some(number)
+            && let Some(paths) = self.paths.all.get_mut(&daemon)
+            && let Some(connection) = self.connections.get_mut(number)
+            && let Some(watch) = &mut connection.watch
+        {
+            let exchange = Exchange::from(&connection.quic.stats());
+            if paths.failover.handle_exchange(exchange) {
+                watch.restart(exchange);
+            }
+        }
+    }
+
+    /// Returns when [`look_at_paths`](Self::look_at_paths) is due.
+    pub(super) fn paths_timeout(&self) -> Option<Duration> {
+        let all = self.paths.all.iter().filter(|_| !self.closing);
+        let due = all.filter_map(|(daemon, paths)| {
+            if self.table.standby(*daemon).is_none() {
+                let waits = self.dials.is_dialling(*daemon);
+                return paths.search.poll_timeout().filter(|_| !waits);
+            }
+            let connection = self.connections.get(self.table.current(*daemon)?)?;
+            let since = connection.watch.as_ref().and_then(AnswerWatch::since);
+            paths.failover.poll_timeout(since, connection.quic.rtt())
+        });
+        due.min()
+    }
+
+    /// Does the work of the paths that is due.
+    pub(super) fn look_at_paths(&mut self, now: Duration) {
+        if self.paths_timeout().is_none_or(|due| now < due) {
+            return;
+        }
+        for daemon in self.paths.all.keys().copied().collect::<Vec<_>>() {
+            let Some(number) = self.table.current(daemon) else { continue };
+            match self.table.standby(daemon) {
+                Some(standby) => self.compare_paths(daemon, number, standby, now),
+                None => self.probe_paths(daemon, number, now),
+            }
+        }
+    }
+
+    fn compare_paths(&mut self, daemon: DaemonId, number: u64, standby: u64, now: Duration) {
+        let of_standby = self.exchange(standby);
+        let (Some(connection), Some(paths)) =
+            (self.connections.get_mut(number), self.paths.all.get_mut(&daemon))
+        else {
+            return;
+        };
+        let in_use = Exchange::from(&connection.quic.stats());
+        let round_trip = connection.quic.rtt();
+        let Some(watch) = &mut connection.watch else { return };
+        let step =
+            paths.failover.handle_timeout(now, watch.since(), in_use, of_standby, round_trip);
+        match step {
+            None => {}
+            Some(FailoverStep::Answered) => watch.restart(in_use),
+            Some(FailoverStep::Ask) => {
+                if let Some(standby) = self.connections.get_mut(standby) {
+                    standby.quic.ping();
+                }
+                self.connections.touch(standby);
+            }
+            Some(FailoverStep::Switch) => {
+                tracing::info!(peer = %daemon,
+                    "the path does not answer and the second one does: the second link takes over");
+                if !self.replace_by_standby(daemon, now) {
+                    self.send(standby, &LinkMessage::SwitchOver, now);
+                }
+            }
+        }
+    }
+
+    fn probe_paths(&mut self, daemon: DaemonId, number: u64, now: Duration) {
+        let Some(in_use) = self.connections.address(number) else { return };
+        // A dial of discovery, or of a successor, is more important.
+        if self.dials.is_dialling(daemon) {
+            return;
+        }
+        let Some(paths) = self.paths.all.get_mut(&daemon) else { return };
+        let round = paths.search.handle_timeout(now, in_use, || self.random.random());
+        for (to, nonce) in round.probes {
+            let probe = Datagram::Probe { daemon: self.hello.daemon, nonce };
+            self.connections.endpoints().send(to, probe.encode());
+        }
+        if let Some(address) = round.dial {
+            self.dial_standby(daemon, address, now);
+        }
+    }
+
+    /// Returns whether answers to probes of other paths are expected.
+    pub(super) fn probes_paths(&self) -> bool {
+        !self.paths.all.is_empty()
+    }
+
+    /// Handles an answer to a probe, which may be one of another path. It came to the address `local` of this host.
+    pub(super) fn handle_path_echo(
+        &mut self,
+        now: Duration,
+        (from, local): (SocketAddr, Option<IpAddr>),
+        daemon: DaemonId,
+        nonce: Nonce,
+    ) {
+        let Some(number) = self.table.current(daemon) else { return };
+        let in_use = self.connections.get(number).and_then(Connection::local);
+        let Some(paths) = self.paths.all.get_mut(&daemon) else { return };
+        let is_apart = is_apart(in_use, local);
+        let address = paths.search.handle_echo(now, from, nonce, is_apart);
+        if let Some(address) = address
+            && self.table.standby(daemon).is_none()
+            && !self.dials.is_dialling(daemon)
+        {
+            self.dial_standby(daemon, address, now);
+        }
+    }
+
+    /// Dials a link that is to stand by.
+    fn dial_standby(&mut self, daemon: DaemonId, address: SocketAddr, now: Duration) {
+        let Some(peer) = self.table.current_peer(daemon) else { return };
+        let target = DialTarget {
+            daemon: Some(daemon),
+            sae: peer.summary.hello.sae.clone(),
+            addresses: vec![address],
+            listed: false,
+            standing: None,
+            replaces: None,
+            beside: peer.elected.map(|elected| elected.link),
+        };
+        tracing::debug!(peer = %daemon, %address, "dialling a link over a second path");
+        self.dial(target, now);
+    }
+
+    /// Sets the addresses at which discovery knows a linked peer, best first.
+    pub(in crate::engine) fn set_addresses(&mut self, daemon: DaemonId, addresses: &[SocketAddr]) {
+        if let Some(paths) = self.paths.all.get_mut(&daemon) {
+            paths.search.set_addresses(addresses);
+        }
+    }
+
+    /// Returns the status of the link that stands by for a peer.
+    pub(in crate::engine) fn standby_status(&self, daemon: DaemonId) -> Option<StandbyStatus> {
+        let connection = self.connections.get(self.table.standby(daemon)?)?;
+        let mut status = StandbyStatus::default();
+        status.address = connection.quic.remote_address().to_string();
+        status.rtt = connection.quic.rtt();
+        Some(status)
+    }
+}
+
+/// Returns whether two local addresses are probably of different interfaces. An interface often has an address of either
+/// family.
+fn is_apart(one: Option<IpAddr>, other: Option<IpAddr>) -> bool {
+    let canonical = |address: Option<IpAddr>| address.map(|address| address.to_canonical());
+    match (canonical(one), canonical(other)) {
+        (Some(one), Some(other)) => one != other && one.is_ipv4() == other.is_ipv4(),
+        _ => false,
+    }
+}

@@ -1,0 +1,343 @@
+//! Hosts with two interfaces: a second link stands by over the second path, and takes over when the first is cut.
+
+#![allow(clippy::print_stdout, reason = "a scenario prints its figures")]
+
+use std::{net::Ipv4Addr, time::Duration};
+
+use axon_shm::qos::Qos;
+use axon_transport::config::{Config, KeyMode, Security};
+use rand::RngExt;
+
+use crate::engine::{
+    keyring::tests::config as qkd,
+    sim::{
+        network::Path,
+        rng::{Stream, stream},
+        tests::{Settings, millis, modes, secs},
+        world::{Pair, World},
+    },
+};
+
+/// Traffic goes on within this time after a path is cut, if the other one works.
+const SWITCHED: Duration = Duration::from_millis(500);
+
+/// Two hosts with two interfaces each and a KEEP_ALL publisher each.
+struct TwoPaths {
+    world: World,
+    pairs: [Pair; 2],
+    published: [u64; 2],
+    /// The addresses of host 1, by path.
+    addresses: [Ipv4Addr; 2],
+    /// Time between two samples of a publisher, in milliseconds. The history has 256.
+    every: u32,
+}
+
+/// Returns settings with this number of paths.
+fn with_paths(
+    config: impl Fn(usize) -> Config,
+    paths: impl Fn(usize) -> u8,
+) -> impl Fn(usize) -> Config {
+    move |host| {
+        let mut config = config(host);
+        config.link.paths = paths(host);
+        config
+    }
+}
+
+impl TwoPaths {
+    fn new(seed: u64, config: &Settings) -> Self {
+        Self::with(seed, with_paths(config, |_| 2))
+    }
+
+    fn with(seed: u64, config: impl Fn(usize) -> Config) -> Self {
+        let mut world = World::new(seed, 2, config);
+        world.network.set_default_path(Path { delay: millis(2), ..Path::default() });
+        let second = [0, 1].map(|host| world.add_second_interface(host))[1];
+        let pairs =
+            [world.pair(0, 1, "/out", Qos::keep_all()), world.pair(1, 0, "/in", Qos::keep_all())];
+        world.until(secs(20), World::is_whole);
+        world.hear_all_addresses();
+        world.run_for(secs(4));
+        let addresses = [world.hosts[1].address, second];
+        Self { world, pairs, published: [0; 2], addresses, every: 10 }
+    }
+
+    /// Returns which path host 0 uses.
+    fn in_use(&self) -> usize {
+        let status = self.world.hosts[0].status.values().next().expect("a link");
+        self.addresses.iter().position(|a| status.address.starts_with(&format!("{a}:"))).unwrap()
+    }
+
+    /// Returns whether each host has a link that stands by.
+    fn stands_by(&self) -> [bool; 2] {
+        [0, 1].map(|host| self.world.hosts[host].status.values().any(|link| link.standby.is_some()))
+    }
+
+    fn set_path(&mut self, path: usize, works: bool) {
+        self.world.network.set_interface_up(self.addresses[path], works);
+    }
+
+    /// Publishes samples in both directions for so long. Returns the longest time without an arrival.
+    fn publish(&mut self, time: Duration) -> Duration {
+        let end = self.world.now + time;
+        let mut gap = Duration::ZERO;
+        let mut last = [(self.world.now, 0); 2];
+        while self.world.now < end {
+            for (pair, published) in self.pairs.iter().zip(&mut self.published) {
+                let published_one = self.world.publish(*pair, 1000);
+                assert!(published_one, "the history is full: {}", self.world.describe());
+                *published += 1;
+            }
+            for _ in 0..self.every {
+                self.world.run_for(millis(1));
+                for (pair, last) in self.pairs.iter().zip(&mut last) {
+                    let received = self.world.received(*pair).len();
+                    if received > last.1 {
+                        *last = (self.world.now, received);
+                    }
+                    gap = gap.max(self.world.now - last.0);
+                }
+            }
+        }
+        gap
+    }
+
+    /// Everything arrives, once and in order, and no host took the other one for gone.
+    fn is_complete(&mut self, case: &str) {
+        self.world.run_for(secs(5));
+        for (pair, published) in self.pairs.iter().zip(self.published) {
+            let complete = self.world.received(*pair).into_iter().eq(1..=published);
+            assert!(complete, "{case}: {}", self.world.describe());
+        }
+        let refusals = self.world.hosts.iter().flat_map(|host| &host.refusals);
+        let flaps = refusals.filter(|(_, text)| text.starts_with("down") || text == "silent");
+        assert_eq!(flaps.count(), 0, "{case}: {}", self.world.describe());
+    }
+}
+
+#[test]
+fn traffic_moves_to_the_second_path_when_the_first_is_cut() {
+    for (mode, config) in modes() {
+        let mut paths = TwoPaths::new(60, &config);
+        assert_eq!((paths.in_use(), paths.stands_by()), (0, [true; 2]), "{mode}");
+        for round in 0..6 {
+            paths.publish(secs(1));
+            let in_use = paths.in_use();
+            paths.set_path(in_use, false);
+            let gap = paths.publish(secs(2));
+            assert!(gap <= SWITCHED, "{mode}, round {round}: nothing arrived for {gap:?}");
+            assert_eq!(paths.in_use(), 1 - in_use, "{mode}, round {round}");
+            paths.set_path(in_use, true);
+            paths.publish(secs(3));
+            assert_eq!(paths.stands_by(), [true; 2], "{mode}, round {round}: the path is back");
+        }
+        paths.is_complete(mode);
+    }
+}
+
+#[test]
+fn paths_that_are_cut_in_turn_at_random_lose_nothing() {
+    for (number, (mode, config)) in (0..).zip(modes()) {
+        let mut paths = TwoPaths::new(61, &config);
+        let mut random = stream(61 + number, Stream::Script);
+        let mut longest = Duration::ZERO;
+        for _ in 0..20 {
+            let (path, cut) = (random.random_range(0..2), random.random_range(200..5000));
+            paths.set_path(path, false);
+            longest = longest.max(paths.publish(millis(cut)));
+            paths.set_path(path, true);
+            longest = longest.max(paths.publish(millis(random.random_range(1000..4000))));
+        }
+        println!("{mode}: nothing arrived for {longest:?} at most");
+        assert!(longest <= SWITCHED, "{mode}: nothing arrived for {longest:?}");
+        paths.is_complete(mode);
+    }
+}
+
+#[test]
+fn both_paths_cut_at_once_lose_nothing() {
+    for (mode, config) in modes() {
+        let mut paths = TwoPaths::new(62, &config);
+        paths.every = 100;
+        for (first_back, cut) in [(0, 300), (1, 700), (0, 8000), (1, 3000)] {
+            (0..2).for_each(|path| paths.set_path(path, false));
+            paths.publish(millis(cut));
+            paths.set_path(first_back, true);
+            paths.publish(secs(3));
+            paths.set_path(1 - first_back, true);
+            paths.publish(secs(6));
+            assert_eq!(paths.stands_by(), [true; 2], "{mode}: both are back");
+        }
+        paths.is_complete(mode);
+    }
+}
+
+#[test]
+fn path_that_is_cut_in_one_direction_is_left() {
+    for (mode, config) in modes() {
+        for direction in 0..2 {
+            let mut paths = TwoPaths::new(63, &config);
+            let ends = [0, 1].map(|host| paths.world.hosts[host].address);
+            let (from, to) = (ends[direction], ends[1 - direction]);
+            let none = Path { loss: 1.0, ..Path::default() };
+            paths.world.network.set_path_between(from, to, Some(none));
+            let gap = paths.publish(secs(3));
+            assert!(gap <= SWITCHED, "{mode}, {direction}: nothing arrived for {gap:?}");
+            assert_eq!(paths.in_use(), 1, "{mode}, {direction}");
+            paths.is_complete(mode);
+        }
+    }
+}
+
+#[test]
+fn host_that_is_stopped_does_not_make_the_other_one_switch() {
+    let (mode, config) = modes().remove(0);
+    let mut paths = TwoPaths::new(64, &config);
+    for _ in 0..5 {
+        paths.publish(millis(500));
+        paths.world.stop(1, true);
+        paths.publish(secs(2));
+        paths.world.stop(1, false);
+        paths.publish(secs(1));
+        assert_eq!(paths.in_use(), 0, "{mode}: both paths work");
+    }
+    paths.is_complete(mode);
+}
+
+#[test]
+fn one_host_with_one_path_has_no_second_link() {
+    for (mode, config) in modes() {
+        for single in 0..2 {
+            let config = with_paths(&config, |host| if host == single { 1 } else { 2 });
+            let mut paths = TwoPaths::with(65, config);
+            assert_eq!(paths.stands_by(), [false; 2], "{mode}");
+            paths.publish(secs(1));
+            paths.is_complete(mode);
+        }
+    }
+}
+
+#[test]
+fn renewals_of_both_links_lose_nothing_and_leave_a_second_link() {
+    for mode in [KeyMode::Session, KeyMode::Messages10] {
+        let config = |host: usize| {
+            let mut config = qkd(&format!("sae-{host}"), mode);
+            if let Security::Qkd(qkd) = &mut config.security {
+                qkd.session_max_age = secs(20);
+            }
+            config
+        };
+        let mut paths = TwoPaths::with(66, with_paths(config, |_| 2));
+        for _ in 0..12 {
+            paths.publish(secs(10));
+        }
+        let stand = (0..40).filter(|_| {
+            paths.publish(millis(500));
+            paths.stands_by() == [true; 2]
+        });
+        assert!(stand.count() > 20, "{mode:?}: a second link stands by most of the time");
+        let in_use = paths.in_use();
+        paths.publish(secs(3));
+        paths.set_path(in_use, false);
+        paths.publish(secs(6));
+        paths.set_path(in_use, true);
+        paths.is_complete(&format!("{mode:?}"));
+    }
+}
+
+#[test]
+fn daemon_that_is_killed_links_again_over_two_paths() {
+    for (mode, config) in modes() {
+        for host in 0..2 {
+            let mut paths = TwoPaths::new(67, &config);
+            paths.publish(secs(1));
+            paths.world.kill(host, host == 0);
+            paths.world.run_for(millis(100));
+            paths.world.restart(host);
+            paths.world.until(secs(10), World::is_whole);
+            paths.world.hear_all_addresses();
+            paths.world.run_for(secs(5));
+            assert_eq!(paths.stands_by(), [true; 2], "{mode}, {host}: {}", paths.world.describe());
+        }
+    }
+}
+
+#[test]
+fn renewal_of_a_link_without_data_in_flight_delays_no_sample() {
+    for mode in [KeyMode::Session, KeyMode::Messages10] {
+        let config = |host: usize| {
+            let mut config = qkd(&format!("sae-{host}"), mode);
+            if let Security::Qkd(qkd) = &mut config.security {
+                qkd.session_max_age = secs(20);
+            }
+            config
+        };
+        let mut paths = TwoPaths::with(68, config);
+        for _ in 0..4 {
+            // The history holds less than two seconds of samples.
+            let gap = paths.publish(secs(10));
+            assert!(gap < millis(100), "{mode:?}: nothing arrived for {gap:?}");
+        }
+        paths.is_complete(&format!("{mode:?}"));
+    }
+}
+
+#[test]
+fn second_path_that_appears_during_a_cut_takes_over() {
+    for (mode, config) in modes() {
+        let mut paths = TwoPaths::new(69, &config);
+        paths.every = 100;
+        paths.set_path(1, false);
+        // The second link ends where nothing is sent over it: QUIC gives it up after 120 s.
+        paths.publish(secs(140));
+        assert_eq!(paths.stands_by(), [false; 2], "{mode}: {}", paths.world.describe());
+        paths.set_path(0, false);
+        paths.publish(secs(3));
+        paths.set_path(1, true);
+        let gap = paths.publish(secs(15));
+        println!("{mode}: samples flow {gap:?} after the second path appeared");
+        assert_eq!(paths.in_use(), 1, "{mode}: {}", paths.world.describe());
+        paths.set_path(0, true);
+        paths.publish(secs(10));
+        paths.is_complete(mode);
+    }
+}
+
+#[test]
+fn hosts_that_shut_down_with_a_second_link_do_not_spin() {
+    for (mode, config) in modes() {
+        for stands_by in [true, false] {
+            let mut paths = TwoPaths::new(70, &config);
+            if !stands_by {
+                // A second path is being looked for.
+                paths.set_path(1, false);
+                paths.publish(secs(1));
+            }
+            let before = paths.world.passes.clone();
+            paths.world.close(0);
+            paths.world.run_for(secs(5));
+            for (before, after) in before.iter().zip(&paths.world.passes) {
+                assert!(after - before < 200, "{mode}: {} passes in five seconds", after - before);
+            }
+        }
+    }
+}
+
+#[test]
+fn successor_over_the_path_of_the_second_link_ends_that_link() {
+    let (mode, config) = modes().remove(0);
+    let mut paths = TwoPaths::new(71, &config);
+    // Host 1 is heard at its second address alone, and both hosts look for each other there.
+    let daemon = paths.world.hosts[1].daemon;
+    paths.world.hosts[0].moved(daemon, paths.addresses[1]);
+    paths.set_path(0, false);
+    paths.publish(secs(2));
+    assert_eq!(paths.in_use(), 1, "{mode}");
+    paths.set_path(0, true);
+    paths.publish(secs(10));
+    assert_eq!(paths.stands_by(), [true; 2], "{mode}: {}", paths.world.describe());
+    let standby = paths.world.hosts[0].status.values().find_map(|link| link.standby.clone());
+    let first = format!("{}:", paths.addresses[0]);
+    assert!(standby.unwrap().address.starts_with(&first), "{mode}: over the other path");
+    paths.is_complete(mode);
+}
