@@ -320,6 +320,7 @@ impl Connections {
                 continue;
             }
             let most = max_datagrams.min(connection.egress.packets(since));
+            let most = most.min(connection.burst.most());
             let transmit = connection.quic.poll_transmit(now, most, buffer).map(|transmit| {
                 connection.count_sent(&transmit, since);
                 (connection.endpoint, transmit)
@@ -331,6 +332,7 @@ impl Connections {
                 return Some(transmit);
             }
             if let Some(connection) = self.all.get_mut(&number) {
+                connection.burst.handle_pass();
                 connection.is_transmitting = false;
             }
         }

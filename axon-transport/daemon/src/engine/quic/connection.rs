@@ -12,6 +12,7 @@ use rustls_pki_types::CertificateDer;
 
 use super::{
     answers::{AnswerWatch, Exchange},
+    burst::Burst,
     control_stream::ControlStream,
     link_rate::LinkRate,
 };
@@ -67,6 +68,8 @@ pub(crate) struct Connection {
     loss: PacketLoss,
     /// The rate that the connection carries.
     rate: LinkRate,
+    /// The datagrams that leave together.
+    pub(in crate::engine) burst: Burst,
     /// True if it is in the list of connections with something to do.
     pub(in crate::engine) is_dirty: bool,
     /// True if it is in the list of connections that may transmit.
@@ -96,6 +99,7 @@ impl Connection {
             egress: Egress::default(),
             loss: PacketLoss::default(),
             rate: LinkRate::default(),
+            burst: Burst::default(),
             is_dirty: false,
             is_transmitting: false,
             deadline: None,
@@ -174,7 +178,9 @@ impl Connection {
             watch.handle_sent(|| Exchange::from(&self.quic.stats()), now);
         }
         let each = transmit.segment_size.unwrap_or(transmit.size).max(1);
-        let packets = transmit.size.div_ceil(each) as u64;
+        let packets = transmit.size.div_ceil(each);
+        self.burst.handle_sent(packets);
+        let packets = packets as u64;
         let headers = if transmit.destination.is_ipv4() { 28 } else { 48 };
         self.egress.sent(packets, transmit.size as u64 + packets * headers, now);
     }
@@ -206,6 +212,7 @@ impl Connection {
             loses: self.loss.share >= LOSES,
             rate: self.rate.get(now).into_iter().chain(self.egress.rate()).reduce(f64::min),
             measured: &mut self.rate,
+            burst: &mut self.burst,
         }
     }
 }
@@ -277,6 +284,7 @@ pub(crate) struct Carrier<'a> {
     /// The rate that the link carries in bytes per second, if the link was full lately or a limit states the rate.
     pub(in crate::engine) rate: Option<f64>,
     measured: &'a mut LinkRate,
+    burst: &'a mut Burst,
 }
 
 impl Carrier<'_> {
@@ -313,6 +321,7 @@ impl Carrier<'_> {
     /// samples in QUIC until then. The link `is_full` while a flow waits for QUIC.
     pub(in crate::engine) fn rest(&mut self, least: Option<u64>, is_full: bool, now: Duration) {
         self.quic.set_send_window(least.unwrap_or(self.bulk));
+        self.burst.set_full(is_full);
         let left = || {
             let stats = self.quic.stats();
             stats.udp_tx.bytes.saturating_sub(stats.path.lost_bytes)

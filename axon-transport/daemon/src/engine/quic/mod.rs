@@ -1,6 +1,7 @@
 //! The parts of QUIC that the engine uses: endpoints, connections with their control stream, and the settings of both.
 
 pub(crate) mod answers;
+pub(crate) mod burst;
 pub(crate) mod connection;
 pub(crate) mod control_stream;
 pub(crate) mod endpoints;

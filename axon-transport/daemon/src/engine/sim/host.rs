@@ -47,6 +47,8 @@ use crate::{
 
 /// The port of QUIC on each host.
 pub(super) const PORT: u16 = 61_300;
+/// Datagrams that leave together at most.
+pub(super) const BATCH: usize = 44;
 /// What the thread that compresses samples takes in, in bytes a second.
 const COMPRESSOR: f64 = 300e6;
 
@@ -532,6 +534,6 @@ impl Host {
         now: Duration,
     ) -> Option<Transmit> {
         self.due.set(None);
-        Some(self.engine.as_mut()?.poll_transmit(10, buffer, now)?.1)
+        Some(self.engine.as_mut()?.poll_transmit(BATCH, buffer, now)?.1)
     }
 }

@@ -11,6 +11,7 @@ use axon_shm::qos::Qos;
 use axon_transport::config::{Config, KeyMode};
 
 use super::{
+    host::BATCH,
     network::Path,
     run::run,
     script::{Recipe, Script, Weights},
@@ -85,6 +86,38 @@ fn all_samples_arrive_over_a_lossy_path() {
     }
     world.run_for(secs(20));
     assert_eq!(world.received(pair).len() as u64, published, "{}", world.describe());
+}
+
+#[test]
+fn a_lone_sample_leaves_in_pieces_and_a_stream_in_whole_batches() {
+    let mut world = World::new(5, 2, classic);
+    let pair = world.pair(0, 1, "/t", Qos::keep_all());
+    world.until(secs(5), World::is_whole);
+    world.run_for(secs(1));
+    let lone = |world: &mut World| {
+        world.batches.insert(0, Vec::new());
+        assert!(world.publish(pair, 64 << 10));
+        world.run_for(millis(20));
+        world.batches.remove(&0).unwrap()
+    };
+    // Until the congestion window lets a whole sample leave at once.
+    for _ in 0..20 {
+        lone(&mut world);
+    }
+    for _ in 0..3 {
+        let batches = lone(&mut world);
+        assert!(batches.len() >= 3 && batches.iter().all(|batch| *batch <= 16), "{batches:?}");
+    }
+    world.batches.insert(0, Vec::new());
+    for _ in 0..100 {
+        while world.publish(pair, 64 << 10) {}
+        world.run_for(millis(1));
+    }
+    let batches = &world.batches[&0];
+    let sent: usize = batches.iter().sum();
+    let whole = batches.iter().filter(|batch| **batch == BATCH).count() * BATCH;
+    println!("{sent} datagrams of a stream, {whole} of them in whole batches");
+    assert!(whole * 10 > sent * 9, "{batches:?}");
 }
 
 #[test]

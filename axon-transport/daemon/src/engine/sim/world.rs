@@ -1,7 +1,7 @@
 //! A world of hosts on one network, with a virtual clock.
 
 use std::{
-    collections::{BTreeMap, BTreeSet},
+    collections::{BTreeMap, BTreeSet, HashMap},
     fmt::Write,
     iter,
     net::{IpAddr, Ipv4Addr, SocketAddr},
@@ -49,6 +49,8 @@ pub(super) struct World {
     stopped: Vec<bool>,
     /// Passes of each host since the start.
     pub(super) passes: Vec<u64>,
+    /// Datagrams in each batch of several that a host sent, for the hosts of the map.
+    pub(super) batches: HashMap<usize, Vec<usize>>,
     /// Publishers and subscriptions whose samples are checked.
     pub(super) pairs: Vec<Pair>,
 }
@@ -89,6 +91,7 @@ impl World {
             answers: Vec::new(),
             stopped: vec![false; hosts],
             passes: vec![0; hosts],
+            batches: HashMap::new(),
             pairs: Vec::new(),
         }
     }
@@ -406,6 +409,11 @@ impl World {
             // The routing table sends to each network through the interface that is in it.
             let from = second.filter(|_| is_second(to.ip())).unwrap_or(first);
             let from = SocketAddr::from((from, PORT));
+            if let (Some(each), Some(batches)) =
+                (transmit.segment_size, self.batches.get_mut(&number))
+            {
+                batches.push(transmit.size.div_ceil(each));
+            }
             self.network.send(now, from, to, transmit.ecn, bytes, transmit.segment_size);
         }
     }

@@ -1,0 +1,101 @@
+//! The number of datagrams that leave together.
+//!
+//! The kernel hands a batch to the peer as one message, so the peer decrypts the first datagram once the last one is
+//! encrypted. A sample of 64 KiB in one batch is encrypted and decrypted one after the other; in pieces, both sides
+//! work at the same time. Each piece costs a system call on either side, which a stream does not need: its peer has
+//! datagrams to decrypt all the time.
+
+/// Datagrams in each of the first pieces of a burst. With half as many the system calls cost what the peer gains.
+const PIECE: usize = 16;
+/// A later piece holds at most this part of the datagrams before it in the burst: a quarter.
+const PART: usize = 4;
+
+/// The datagrams that one connection sent since it last had nothing to send.
+#[derive(Debug, Default)]
+pub(in crate::engine) struct Burst {
+    sent: usize,
+    /// Those of the current pass.
+    of_pass: usize,
+    /// True if samples wait for QUIC to take more.
+    is_full: bool,
+}
+
+impl Burst {
+    /// Returns the number of datagrams that may leave together.
+    pub(in crate::engine) fn most(&self) -> usize {
+        PIECE.max(self.sent / PART)
+    }
+
+    /// Handles datagrams that leave together.
+    pub(in crate::engine) fn handle_sent(&mut self, datagrams: usize) {
+        self.sent = self.sent.saturating_add(datagrams);
+        self.of_pass = self.of_pass.saturating_add(datagrams);
+    }
+
+    /// Sets whether samples wait for QUIC to take more.
+    pub(in crate::engine) fn set_full(&mut self, is_full: bool) {
+        self.is_full = is_full;
+    }
+
+    /// Handles the end of a pass: QUIC has nothing more to send now. The burst is over if no sample waits and the pass
+    /// sent no more than an acknowledgement.
+    pub(in crate::engine) fn handle_pass(&mut self) {
+        if std::mem::take(&mut self.of_pass) <= 1 && !self.is_full {
+            self.sent = 0;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Most datagrams of a batch of the reactor.
+    const BATCH: usize = 44;
+
+    /// Sends so many datagrams in one pass. Returns the pieces.
+    fn pass(burst: &mut Burst, mut datagrams: usize) -> Vec<usize> {
+        let mut pieces = Vec::new();
+        while datagrams > 0 {
+            let piece = datagrams.min(burst.most()).min(BATCH);
+            burst.handle_sent(piece);
+            pieces.push(piece);
+            datagrams -= piece;
+        }
+        burst.handle_pass();
+        pieces
+    }
+
+    #[test]
+    fn a_sample_of_64_kib_leaves_in_three_pieces_each_time() {
+        let mut burst = Burst::default();
+        for _ in 0..3 {
+            assert_eq!(pass(&mut burst, 47), [16, 16, 15]);
+            assert_eq!(pass(&mut burst, 1), [1], "an acknowledgement");
+        }
+    }
+
+    #[test]
+    fn pieces_of_a_longer_burst_grow() {
+        let mut burst = Burst::default();
+        let pieces = pass(&mut burst, 400);
+        assert_eq!(pieces[..8], [16, 16, 16, 16, 16, 20, 25, 31]);
+        assert_eq!(pieces[8..13], [39, 44, 44, 44, 44]);
+        // A stream goes on in the next pass.
+        assert_eq!(pass(&mut burst, 100), [44, 44, 12]);
+    }
+
+    #[test]
+    fn a_burst_lasts_while_samples_wait_for_quic() {
+        let mut burst = Burst::default();
+        pass(&mut burst, 400);
+        burst.set_full(true);
+        for _ in 0..3 {
+            pass(&mut burst, 0);
+        }
+        assert_eq!(pass(&mut burst, 50), [44, 6]);
+        burst.set_full(false);
+        pass(&mut burst, 0);
+        assert_eq!(pass(&mut burst, 50), [16, 16, 16, 2]);
+    }
+}
