@@ -284,12 +284,13 @@ pub(crate) enum Bench {
 }
 
 const BENCH_NET_HELP: &str = "\
-Two hosts with a daemon each, on this machine's loopback: latency, and streams of a publisher that \
+Two hosts with a daemon each, on this machine's loopback: latency, also at 100 Hz and 1 kHz beside a \
+wake-up, and streams of a publisher that \
 waits for a slow reader (KEEP_ALL) and of one that overtakes it (KEEP_LAST), each beside a stream of \
 bare quinn in the same run (written and read 64 KiB at a time, where messages follow each other), with \
 the processor time of a message in all processes. With X25519MLKEM768 \
 (classic) and with keys of two KMEs that are simulated. The rest of the machine should be idle. \
-About three minutes; --quick takes seconds and is only to see it run. Writes net.json.
+About five minutes; --quick takes seconds and is only to see it run. Writes net.json.
 
 Examples:
   axon bench net

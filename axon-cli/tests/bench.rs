@@ -294,6 +294,17 @@ fn a_quick_run_between_two_hosts_has_every_mode_and_size() {
             check_times(&row["bare"]);
             check_times(&row["axon"]);
         }
+        let paced = rows(mode, "paced");
+        let loads: Vec<_> = paced.iter().map(|row| (&row["pace_ns"], &row["bytes"])).collect();
+        // A longer message than one packet holds has no pace.
+        let size = Value::from(64);
+        let paces = [10_000_000, 1_000_000].map(Value::from);
+        assert_eq!(loads, paces.iter().map(|pace| (pace, &size)).collect::<Vec<_>>());
+        for row in paced {
+            for times in ["wake_up", "bare", "axon"] {
+                check_times(&row[times]);
+            }
+        }
         for row in rows(mode, "streams") {
             let of = |what: &str, count: &str| row[what][count].as_u64().expect("a number");
             for waits in ["bare", "keep_all"] {

@@ -17,7 +17,8 @@ use self::{
     stream::{Flow, Reader, Streamed},
 };
 use super::{
-    harness::{self, Load, Medium, Motion, Pair, Progress, Rounds, Wake},
+    PACES,
+    harness::{self, Load, Medium, Motion, Pair, Progress, Raw, Rounds, Sleeps, Wake, words},
     run::Run,
     session::medium::Sessions,
 };
@@ -29,6 +30,9 @@ use crate::{
 
 const SIZES: [usize; 6] = [64, 1 << 10, 4 << 10, 64 << 10, 1 << 20, 4 << 20];
 const QUICK_SIZES: [usize; 2] = [64, 64 << 10];
+/// Messages that have a pace are no longer than this, so that one packet holds them: bare quinn has no thread that would
+/// take in the acknowledgements for which the rest of a longer one waits.
+const MAX_PACED: usize = 1 << 10;
 
 const ANSWERING: &str = "bench-net-answer";
 const READING: &str = "bench-net-read";
@@ -38,6 +42,22 @@ struct Latency {
     size: usize,
     bare: Rounds,
     axon: Rounds,
+}
+
+/// A message whenever one is due; times are from just before it is sent to when it was taken.
+struct Paced {
+    load: Load,
+    /// From one process to another in shared memory: one wake-up.
+    wake_up: Rounds,
+    bare: Rounds,
+    axon: Rounds,
+}
+
+impl Paced {
+    /// The most that AXON may take: bare quinn's time, and a wake-up of each daemon.
+    fn allowed(&self) -> f64 {
+        self.bare.typical() + 2.0 * self.wake_up.typical()
+    }
 }
 
 /// Streams of one size, by turns; of each the best turn.
@@ -51,6 +71,8 @@ struct Streams {
 struct Measured {
     mode: Mode,
     latency: Vec<Latency>,
+    /// By pace, then by size.
+    paced: Vec<Paced>,
     streams: Vec<Streams>,
 }
 
@@ -89,9 +111,9 @@ pub(crate) fn read() -> Result<(), CliError> {
     stream::attend().map_err(CliError::failed)
 }
 
-/// The raw limit first.
-fn media(sessions: &Sessions) -> [&dyn Medium; 2] {
-    [&BareQuic, sessions]
+/// The raw limits first. The wake-up alone is for messages that have a pace.
+fn media(sessions: &Sessions) -> [&dyn Medium; 3] {
+    [&Raw(Sleeps::Epoll), &BareQuic, sessions]
 }
 
 fn measure(sizes: &[usize], modes: &[Mode], quick: bool) -> harness::Result<Results> {
@@ -102,7 +124,9 @@ fn measure(sizes: &[usize], modes: &[Mode], quick: bool) -> harness::Result<Resu
     let runtime =
         tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
     let kmes = runtime.block_on(Kmes::start(directory.path()))?;
-    let progress = Progress::new(modes.len() * sizes.len() * 2);
+    let paced_sizes = || sizes.iter().copied().filter(|size| *size <= MAX_PACED);
+    let steps = sizes.len() * 2 + paced_sizes().count() * PACES.len();
+    let progress = Progress::new(modes.len() * steps);
     let mut measured = Vec::new();
     for mode in modes {
         let hosts = Hosts::start(&runtime, *mode, &kmes, directory.path())?;
@@ -118,6 +142,17 @@ fn measure(sizes: &[usize], modes: &[Mode], quick: bool) -> harness::Result<Resu
                 pair.latency(&load)?.try_into().map_err(|_| "a medium without figures")?;
             latency.push(Latency { size: *size, bare, axon });
             progress.advance();
+        }
+        let mut paced = Vec::new();
+        for pace in PACES {
+            progress.step(&format!("latency at {}, {}", words::pace(pace), mode.route()));
+            for size in paced_sizes() {
+                let load = Load::paced(size, Motion::Copy, pace);
+                let rounds = pair.paced(&load)?.try_into();
+                let [wake_up, bare, axon] = rounds.map_err(|_| "a medium without figures")?;
+                paced.push(Paced { load, wake_up, bare, axon });
+                progress.advance();
+            }
         }
         drop(pair);
 
@@ -145,7 +180,7 @@ fn measure(sizes: &[usize], modes: &[Mode], quick: bool) -> harness::Result<Resu
             streams.push(Streams { size: *size, bare, waits, overtakes });
             progress.advance();
         }
-        measured.push(Measured { mode: *mode, latency, streams });
+        measured.push(Measured { mode: *mode, latency, paced, streams });
     }
     Ok(Results { run, modes: measured })
 }

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use serde_json::{Value, json};
 
-use super::{Measured, Results, Streams, stream::Streamed};
+use super::{Measured, Paced, Results, Streams, stream::Streamed};
 use crate::{
     bench::{
         budgets::{self, verdict},
@@ -16,7 +16,9 @@ use crate::{
 /// How figures are taken; in every output.
 const REPORTED: &str = "AXON between two hosts on one machine's loopback, and one stream of bare \
                         quinn, take turns. Latency is one way (half a round trip), of the round \
-                        with the least median; of streams the best of the turns counts. In a stream \
+                        with the least median; of streams the best of the turns counts. Messages at a \
+                        pace are timed one way, and the median of the rounds' medians counts: AXON may \
+                        take bare quinn's and two wake-ups, one of each daemon. In a stream \
                         quinn is written and read 64 KiB at a time, and runs in the application's \
                         thread or in one of its own, whichever is faster. CPU is the processor time of \
                         a message in all processes: both applications, AXON's two daemons, and in \
@@ -27,6 +29,10 @@ pub(super) fn text(results: &Results) -> String {
     for measured in &results.modes {
         let _ = writeln!(out, "\nLatency, {}.\n", measured.mode.route());
         out += &latency(measured);
+        if !measured.paced.is_empty() {
+            let _ = writeln!(out, "\nLatency at a pace, {}.\n", measured.mode.route());
+            out += &paced(measured);
+        }
         let _ = writeln!(out, "\nStreams, {}, in messages a second.\n", measured.mode.route());
         out += &streams(measured);
     }
@@ -46,6 +52,37 @@ fn latency(measured: &Measured) -> String {
         cells.extend(times.into_iter().flatten());
         cells.extend([&row.bare, &row.axon].map(|rounds| words::nanoseconds(rounds.cpu())));
         cells.push(format!("{:.2}", row.axon.to(&row.bare).best));
+        table.row(cells);
+    }
+    table.render(0)
+}
+
+fn paced(measured: &Measured) -> String {
+    let header = [
+        ">size",
+        ">pace",
+        ">wake-up",
+        ">bare p50",
+        ">p99",
+        ">AXON p50",
+        ">p99",
+        ">CPU: bare",
+        ">AXON",
+        ">bare and two wake-ups",
+        "at most",
+    ];
+    let mut table = TextTable::new(&header);
+    for row in &measured.paced {
+        let Paced { load, wake_up, bare, axon } = row;
+        let pace = load.pace.map_or_else(String::new, words::pace);
+        let mut cells = vec![words::size(load.size), pace, words::nanoseconds(wake_up.typical())];
+        for rounds in [bare, axon] {
+            cells.push(words::nanoseconds(rounds.typical()));
+            cells.push(rounds.all().tail(99.0).map_or("-".to_owned(), words::nanoseconds));
+        }
+        cells.extend([bare, axon].map(|rounds| words::nanoseconds(rounds.cpu())));
+        cells.push(words::nanoseconds(row.allowed()));
+        cells.push(verdict(axon.typical() / row.allowed(), 1.0).to_owned());
         table.row(cells);
     }
     table.render(0)
@@ -119,6 +156,16 @@ pub(super) fn json(results: &Results) -> String {
                 "ratio": row.axon.to(&row.bare).best,
             })
         });
+        let paced = measured.paced.iter().map(|row| {
+            json!({
+                "bytes": row.load.size,
+                "pace_ns": row.load.pace.map(|pace| pace.as_nanos() as u64),
+                "wake_up": row.wake_up.json(),
+                "bare": row.bare.json(),
+                "axon": row.axon.json(),
+                "allowed_ns": row.allowed(),
+            })
+        });
         let streams = measured.streams.iter().map(|row| {
             json!({
                 "bytes": row.size,
@@ -132,6 +179,7 @@ pub(super) fn json(results: &Results) -> String {
         json!({
             "mode": measured.mode.stem(),
             "latency": latency.collect::<Vec<_>>(),
+            "paced": paced.collect::<Vec<_>>(),
             "streams": streams.collect::<Vec<_>>(),
         })
     });
