@@ -1179,6 +1179,20 @@ axon_ret_t axon_session_server_respond(struct axon_server_t server,
                                        size_t len);
 
 /**
+ * Answers as `axon_session_server_respond` does, with the caller's `source_timestamp`: nanoseconds since the
+ * Unix epoch, or AXON_TIME_NOW.
+ *
+ * # Safety
+ * As for `axon_session_server_respond`.
+ */
+axon_ret_t axon_session_server_respond_at(struct axon_server_t server,
+                                          const struct axon_gid_t *client,
+                                          uint64_t sequence,
+                                          int64_t source_timestamp,
+                                          const uint8_t *data,
+                                          size_t len);
+
+/**
  * Sets the callback for new requests, as `axon_session_subscription_set_callback` does.
  *
  * # Safety

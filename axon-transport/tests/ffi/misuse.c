@@ -157,6 +157,7 @@ static void use(uint64_t id) {
     NO_HANDLE(axon_session_server_take(server, room, &message, NULL, &byte));
     NO_HANDLE(axon_session_server_take_sample(server, &sample, &bytes, &size, NULL));
     NO_HANDLE(axon_session_server_respond(server, &gid, 1, NULL, 0));
+    NO_HANDLE(axon_session_server_respond_at(server, &gid, 1, 77, NULL, 0));
     NO_HANDLE(axon_session_server_set_callback(server, NULL, NULL));
     NO_HANDLE(axon_session_client_create(node, &options, &client));
     NO_HANDLE(axon_session_client_destroy(client));

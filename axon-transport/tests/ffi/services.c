@@ -81,7 +81,7 @@ void case_services(void) {
 
     /* In whatever order, to nobody but who asked. */
     OK(axon_session_server_respond(server, &gids[0], second, (const uint8_t *)"7", 1));
-    OK(axon_session_server_respond(server, &gids[0], first, (const uint8_t *)"3", 1));
+    OK(axon_session_server_respond_at(server, &gids[0], first, 77, (const uint8_t *)"3", 1));
     asked.id = 0, answered[0] = clients[0], answered[1] = clients[1];
     OK(axon_session_wait(place.session, &set, PATIENCE));
     CHECK(answered[0].id == clients[0].id && answered[1].id == 0);
@@ -91,9 +91,11 @@ void case_services(void) {
     OK(axon_session_client_set_callback(clients[0], NULL, NULL));
     CHECK(take_response(clients[0], &message));
     CHECK(message.bytes[0] == '7' && message.info.publication_sequence == second);
+    CHECK(message.info.source_timestamp > 77);
     CHECK(memcmp(&message.info.sender, &gids[2], sizeof gids[2]) == 0);
     OK(axon_session_client_take_sample(clients[0], &sample, &data, &len, &info));
     CHECK(len == 1 && data[0] == '3' && info.publication_sequence == first);
+    CHECK(info.source_timestamp == 77);
     OK(axon_session_sample_release(sample));
     CHECK(!take_response(clients[0], &message) && !take_response(clients[1], &message));
 
@@ -114,6 +116,8 @@ void case_services(void) {
     REFUSED(axon_session_client_create(place.node, &options, NULL));
     REFUSED(axon_session_server_respond(server, NULL, 1, NULL, 0));
     REFUSED(axon_session_server_respond(server, &gids[0], 1, NULL, 1));
+    REFUSED(axon_session_server_respond_at(server, NULL, 1, 77, NULL, 0));
+    REFUSED(axon_session_server_respond_at(server, &gids[0], 1, 77, NULL, 1));
     REFUSED(axon_session_client_request(clients[0], NULL, 1, NULL));
     REFUSED(axon_session_server_take(server, NULL, NULL, NULL, &byte));
     REFUSED(axon_session_client_take(clients[0], room, &message, NULL, NULL));

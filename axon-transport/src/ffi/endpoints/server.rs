@@ -4,6 +4,7 @@ use std::ffi::c_void;
 
 use super::{
     endpoint::{axon_endpoint_options_t, axon_gid_t, describe, end, matched, set_callback, spec},
+    publisher::{AXON_TIME_NOW, time},
     subscription::{CopyTarget, SampleInPlace, axon_message_info_t, axon_room_t},
 };
 use crate::{
@@ -16,6 +17,7 @@ use crate::{
         qos::axon_qos_t,
     },
     ids::Gid,
+    session::from_unix_nanos,
 };
 
 /// Creates a server in a node. `topic` in the options is the service's name. A KEEP_LAST server keeps the
@@ -135,13 +137,35 @@ pub unsafe extern "C" fn axon_session_server_respond(
     data: *const u8,
     len: usize,
 ) -> axon_ret_t {
+    // SAFETY: guaranteed by the caller.
+    unsafe { axon_session_server_respond_at(server, client, sequence, AXON_TIME_NOW, data, len) }
+}
+
+/// Answers as `axon_session_server_respond` does, with the caller's `source_timestamp`: nanoseconds since the
+/// Unix epoch, or AXON_TIME_NOW.
+///
+/// # Safety
+/// As for `axon_session_server_respond`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn axon_session_server_respond_at(
+    server: axon_server_t,
+    client: *const axon_gid_t,
+    sequence: u64,
+    source_timestamp: i64,
+    data: *const u8,
+    len: usize,
+) -> axon_ret_t {
     guarded(|| {
         let server = named(server)?;
         // SAFETY: guaranteed by the caller.
         let client = unsafe { value(client, "the client's GID") }?;
         // SAFETY: guaranteed by the caller.
         let payload = unsafe { elements(data, len, "the response") }?;
-        let sent = server.send_response(Gid(client.bytes), sequence, payload);
+        let client = Gid(client.bytes);
+        let sent = match time(source_timestamp) {
+            Some(time) => server.send_response_at(client, sequence, from_unix_nanos(time), payload),
+            None => server.send_response(client, sequence, payload),
+        };
         sent.map_err(|e| CallFailure::from(e).of_endpoint(server.endpoint()))
     })
 }

@@ -1,6 +1,10 @@
 //! A server of a service: the application's handle.
 
-use std::{fmt, sync::Arc, time::Duration};
+use std::{
+    fmt,
+    sync::Arc,
+    time::{Duration, SystemTime},
+};
 
 use axon_shm::{Meta, PublishError, Sample};
 
@@ -105,6 +109,31 @@ impl Server {
         sequence: u64,
         payload: &[u8],
     ) -> Result<(), PublishError> {
+        self.respond(client, sequence, None, payload)
+    }
+
+    /// Like [`send_response`](Self::send_response), with the caller's source timestamp. A response carries it in
+    /// nanoseconds, which reach from the year 1677 to 2262.
+    ///
+    /// # Errors
+    /// As for [`send_response`](Self::send_response).
+    pub fn send_response_at(
+        &self,
+        client: Gid,
+        sequence: u64,
+        source_timestamp: SystemTime,
+        payload: &[u8],
+    ) -> Result<(), PublishError> {
+        self.respond(client, sequence, Some(clock::unix_nanos(source_timestamp)), payload)
+    }
+
+    fn respond(
+        &self,
+        client: Gid,
+        sequence: u64,
+        source_timestamp: Option<i64>,
+        payload: &[u8],
+    ) -> Result<(), PublishError> {
         if self.session.is_forked() {
             return Err(PublishError::Forked);
         }
@@ -115,7 +144,7 @@ impl Server {
             self.session.wait_changed(CLIENT_MATCH_TIMEOUT, settled);
         }
         let Some(ring) = ring() else { return Ok(()) };
-        let meta = Meta::at_nanos(sequence, clock::wall());
+        let meta = Meta::at_nanos(sequence, source_timestamp.unwrap_or_else(clock::wall));
         ring.publish(meta, payload).map(drop)
     }
 
