@@ -11,6 +11,7 @@
 #include "qos.hpp"
 #include "rmw/rmw.h"
 #include "stream.hpp"
+#include "trace.hpp"
 
 using rmw_axon::Client;
 using rmw_axon::Failure;
@@ -46,6 +47,7 @@ rmw_client_t * rmw_create_client(
       client->rmw.implementation_identifier = rmw_axon::identifier;
       client->rmw.data = client.get();
       client->rmw.service_name = client->name.c_str();
+      rmw_axon::trace::client_created(*client);
       return &client.release()->rmw;
     });
 }
@@ -71,6 +73,8 @@ rmw_ret_t rmw_send_request(
       uint64_t sequence = 0;
       check(axon_session_client_request(of.handle, stream.data(), stream.size(), &sequence));
       *sequence_id = static_cast<int64_t>(sequence);
+      // The sequence number is known only now, so a server may take the request before this event.
+      rmw_axon::trace::send_request(of, ros_request, *sequence_id);
     });
 }
 
@@ -86,6 +90,7 @@ rmw_ret_t rmw_take_response(
       require(taken, "taken");
       *taken = false;
       rmw_axon::Taken response;
+      rmw_axon::trace::Take<Client> traced(of, response, ros_response);
       check(
         axon_session_client_take_sample(
           of.handle, &response.sample, &response.data, &response.size, &response.info));
@@ -100,6 +105,7 @@ rmw_ret_t rmw_take_response(
       request_header->source_timestamp = response.info.source_timestamp;
       request_header->received_timestamp = response.info.received_timestamp;
       *taken = true;
+      traced.delivered();
     });
 }
 

@@ -75,6 +75,7 @@ struct Subscription
 {
   rmw_subscription_t rmw{};
   axon_subscription_t handle{};
+  axon_gid_t gid{};
   rmw_qos_profile_t qos{};
   cdr::Plan plan;
   std::string topic;

@@ -10,6 +10,7 @@
 #include "error.hpp"
 #include "rmw/rmw.h"
 #include "stream.hpp"
+#include "trace.hpp"
 
 namespace rmw_axon
 {
@@ -72,7 +73,7 @@ void publish(Publisher & publisher, void * message, axon_loan_t loan)
 {
   cdr::write_header(static_cast<uint8_t *>(message) - cdr::HEADER);
   const size_t size = cdr::HEADER + publisher.plan.size_of;
-  check(axon_session_loan_publish(loan, size, AXON_TIME_NOW, nullptr));
+  check(axon_session_loan_publish(loan, size, trace::publish(publisher, message), nullptr));
 }
 
 }  // namespace

@@ -11,6 +11,7 @@
 #include "names.hpp"
 #include "qos.hpp"
 #include "rmw/rmw.h"
+#include "trace.hpp"
 
 namespace rmw_axon
 {
@@ -26,14 +27,15 @@ void publish(Publisher & publisher, const void * message)
   uint64_t skipped = 0;
   check(axon_session_publisher_skip_unread(publisher.handle, &skipped));
   if (skipped != 0) {
+    trace::publish(publisher, message);
     return;
   }
   const size_t size = cdr::encoded_size(publisher.plan, message);
   if (size <= SMALL) {
     uint8_t stream[SMALL];
     cdr::encode(publisher.plan, message, stream, size);
-    check(
-      axon_session_publisher_publish(publisher.handle, stream, size, AXON_TIME_NOW, nullptr));
+    const int64_t timestamp = trace::publish(publisher, message);
+    check(axon_session_publisher_publish(publisher.handle, stream, size, timestamp, nullptr));
     return;
   }
   axon_loan_t loan{};
@@ -45,7 +47,7 @@ void publish(Publisher & publisher, const void * message)
     axon_session_loan_abandon(loan);
     throw;
   }
-  check(axon_session_loan_publish(loan, size, AXON_TIME_NOW, nullptr));
+  check(axon_session_loan_publish(loan, size, trace::publish(publisher, message), nullptr));
 }
 
 }  // namespace
@@ -105,6 +107,7 @@ rmw_publisher_t * rmw_create_publisher(
       publisher->rmw.topic_name = publisher->topic.c_str();
       publisher->rmw.options = *publisher_options;
       publisher->rmw.can_loan_messages = publisher->plan.plain;
+      rmw_axon::trace::publisher_created(*publisher);
       return &publisher.release()->rmw;
     });
 }
@@ -141,9 +144,10 @@ rmw_ret_t rmw_publish_serialized_message(
     [&] {
       Publisher & of = publisher_of(publisher);
       require(serialized_message, "serialized_message");
+      const int64_t timestamp = rmw_axon::trace::publish(of, serialized_message);
       check(
         axon_session_publisher_publish(
-          of.handle, serialized_message->buffer, serialized_message->buffer_length, AXON_TIME_NOW,
+          of.handle, serialized_message->buffer, serialized_message->buffer_length, timestamp,
           nullptr));
     });
 }

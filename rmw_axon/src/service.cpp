@@ -11,6 +11,7 @@
 #include "qos.hpp"
 #include "rmw/rmw.h"
 #include "stream.hpp"
+#include "trace.hpp"
 
 using rmw_axon::Failure;
 using rmw_axon::Service;
@@ -71,6 +72,7 @@ rmw_ret_t rmw_take_request(
       require(taken, "taken");
       *taken = false;
       rmw_axon::Taken request;
+      rmw_axon::trace::Take<Service> traced(of, request, ros_request);
       check(
         axon_session_server_take_sample(
           of.handle, &request.sample, &request.data, &request.size, &request.info));
@@ -84,6 +86,7 @@ rmw_ret_t rmw_take_request(
       request_header->source_timestamp = request.info.source_timestamp;
       request_header->received_timestamp = request.info.received_timestamp;
       *taken = true;
+      traced.delivered();
     });
 }
 
@@ -98,8 +101,11 @@ rmw_ret_t rmw_send_response(
       const axon_gid_t client = rmw_axon::to_core(request_header->writer_guid);
       const auto sequence = static_cast<uint64_t>(request_header->sequence_number);
       const rmw_axon::Stream stream(of.plans.response, of.label, ros_response);
+      const int64_t timestamp =
+      rmw_axon::trace::send_response(of, ros_response, client, request_header->sequence_number);
       check(
-        axon_session_server_respond(of.handle, &client, sequence, stream.data(), stream.size()));
+        axon_session_server_respond_at(
+          of.handle, &client, sequence, timestamp, stream.data(), stream.size()));
     });
 }
 

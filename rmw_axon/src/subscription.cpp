@@ -9,6 +9,7 @@
 #include "qos.hpp"
 #include "rmw/rmw.h"
 #include "take.hpp"
+#include "trace.hpp"
 
 using rmw_axon::Failure;
 using rmw_axon::Subscription;
@@ -62,7 +63,7 @@ rmw_subscription_t * rmw_create_subscription(
       options.ignore_local = subscription_options->ignore_local_publications ? 1 : 0;
       check(axon_session_subscription_create(of.handle, &options, &subscription->handle));
       axon_qos_t qos{};
-      check(axon_session_subscription_describe(subscription->handle, nullptr, &qos));
+      check(axon_session_subscription_describe(subscription->handle, &subscription->gid, &qos));
       subscription->qos = rmw_axon::from_core(qos);
       subscription->qos.avoid_ros_namespace_conventions = avoid;
       subscription->topic = topic_name;
@@ -74,6 +75,7 @@ rmw_subscription_t * rmw_create_subscription(
       subscription->rmw.can_loan_messages = subscription->plan.plain;
       // A filter that is asked for is not applied: the caller reads here that it has to filter itself.
       subscription->rmw.is_cft_enabled = false;
+      rmw_axon::trace::subscription_created(*subscription);
       return &subscription.release()->rmw;
     });
 }

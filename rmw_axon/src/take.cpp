@@ -14,6 +14,7 @@
 #include "gid.hpp"
 #include "rmw/rmw.h"
 #include "stream.hpp"
+#include "trace.hpp"
 
 namespace rmw_axon
 {
@@ -45,12 +46,14 @@ void take(const Subscription & subscription, Taken & taken)
 bool take_message(Subscription & subscription, void * message, rmw_message_info_t * info)
 {
   Taken taken;
+  trace::Take<Subscription> traced(subscription, taken, message);
   take(subscription, taken);
   if (!taken) {
     return false;
   }
   read(subscription.plan, subscription.label, taken, message);
   fill(taken.info, info);
+  traced.delivered();
   return true;
 }
 
@@ -60,6 +63,7 @@ void take_serialized(
 {
   *taken_any = false;
   Taken taken;
+  trace::Take<Subscription> traced(subscription, taken, into);
   take(subscription, taken);
   if (!taken) {
     return;
@@ -71,6 +75,7 @@ void take_serialized(
   std::memcpy(into->buffer, taken.data, taken.size);
   into->buffer_length = taken.size;
   fill(taken.info, info);
+  traced.delivered();
   *taken_any = true;
 }
 
@@ -100,6 +105,7 @@ void take_loaned(
   }
   *taken_any = false;
   Taken taken;
+  trace::Take<Subscription> traced(subscription, taken, nullptr);
   take(subscription, taken);
   if (!taken) {
     return;
@@ -126,6 +132,7 @@ void take_loaned(
   }
   *message = lent;
   fill(taken.info, info);
+  traced.delivered(lent);
   *taken_any = true;
 }
 
