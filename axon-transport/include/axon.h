@@ -857,7 +857,8 @@ uint32_t axon_session_abi(void);
 /**
  * Creates a client in a node. `topic` in the options is the service's name. A KEEP_LAST client keeps the
  * newest untaken responses of each server, as many as its depth; a KEEP_ALL client keeps all. When the call
- * returns, the client is matched with the servers in the graph, unless that takes longer than 50 ms.
+ * returns, the client is matched with the servers in the graph, unless that takes longer than 50 ms or many
+ * endpoints are created in a row.
  *
  * Returns the same codes as `axon_session_publisher_create`.
  *
@@ -993,7 +994,8 @@ axon_ret_t axon_session_loan_abandon(struct axon_loan_t loan);
 
 /**
  * Creates a publisher in a node. When the call returns, the publisher is matched with the subscriptions in
- * the graph, unless that takes longer than 50 ms.
+ * the graph, unless that takes longer than 50 ms or many endpoints are created in a row: then a session waits
+ * for a tenth of the time.
  *
  * AXON_RET_INVALID_ARGUMENT: a name, the hash or a policy is out of bounds. AXON_RET_BAD_ALLOC: shared
  * memory is short. AXON_RET_DENIED: the session's permissions do not allow the endpoint.
@@ -1101,7 +1103,7 @@ axon_ret_t axon_session_publisher_assert_liveliness(struct axon_publisher_t publ
  * Creates a server in a node. `topic` in the options is the service's name. A KEEP_LAST server keeps the
  * newest untaken requests of each client, as many as its depth; a KEEP_ALL server keeps all. A kept request
  * is never dropped to make room. When the call returns, the server is matched with the clients in the graph,
- * unless that takes longer than 50 ms.
+ * unless that takes longer than 50 ms or many endpoints are created in a row.
  *
  * Returns the same codes as `axon_session_publisher_create`.
  *
@@ -1204,7 +1206,8 @@ axon_ret_t axon_session_server_set_callback(struct axon_server_t server,
 
 /**
  * Creates a subscription in a node. When the call returns, the subscription is matched with the publishers
- * in the graph, unless that takes longer than 50 ms. Content filters do not exist.
+ * in the graph, unless that takes longer than 50 ms or many endpoints are created in a row. Content filters do
+ * not exist.
  *
  * Returns the same codes as `axon_session_publisher_create`.
  *

@@ -7,6 +7,7 @@ pub(crate) mod endpoint;
 pub(crate) mod pairing;
 mod query;
 pub(crate) mod range;
+mod topic_index;
 mod users;
 pub(crate) mod view;
 
@@ -18,5 +19,6 @@ pub use query::{NamesAndTypes, NodeName, SERVICE_KINDS, TOPIC_KINDS};
 pub(crate) use range::{
     EndpointRange, OutOfRange, RangeToHost, RemoteEndpoint, Scope, out_of_range,
 };
+pub(crate) use topic_index::TopicIndex;
 pub(crate) use users::Users;
 pub use view::{GraphEntry, GraphView};

@@ -72,7 +72,7 @@ impl Session {
 
     /// The graph as the daemon last described it; empty in a forked child.
     pub fn graph(&self) -> Arc<GraphView> {
-        if self.is_forked() { Arc::default() } else { self.shared().state().graph.view.clone() }
+        if self.is_forked() { Arc::default() } else { self.shared().state().graph.indexed.view() }
     }
 
     /// Waits until the graph is as `reached` wants it; whether it is.

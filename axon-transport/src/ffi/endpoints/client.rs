@@ -18,7 +18,8 @@ use crate::ffi::{
 
 /// Creates a client in a node. `topic` in the options is the service's name. A KEEP_LAST client keeps the
 /// newest untaken responses of each server, as many as its depth; a KEEP_ALL client keeps all. When the call
-/// returns, the client is matched with the servers in the graph, unless that takes longer than 50 ms.
+/// returns, the client is matched with the servers in the graph, unless that takes longer than 50 ms or many
+/// endpoints are created in a row.
 ///
 /// Returns the same codes as `axon_session_publisher_create`.
 ///

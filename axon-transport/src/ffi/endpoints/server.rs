@@ -23,7 +23,7 @@ use crate::{
 /// Creates a server in a node. `topic` in the options is the service's name. A KEEP_LAST server keeps the
 /// newest untaken requests of each client, as many as its depth; a KEEP_ALL server keeps all. A kept request
 /// is never dropped to make room. When the call returns, the server is matched with the clients in the graph,
-/// unless that takes longer than 50 ms.
+/// unless that takes longer than 50 ms or many endpoints are created in a row.
 ///
 /// Returns the same codes as `axon_session_publisher_create`.
 ///

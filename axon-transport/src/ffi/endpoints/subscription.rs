@@ -47,7 +47,8 @@ pub struct axon_message_info_t {
 pub type axon_room_t = Option<unsafe extern "C" fn(user: *mut c_void, len: usize) -> *mut u8>;
 
 /// Creates a subscription in a node. When the call returns, the subscription is matched with the publishers
-/// in the graph, unless that takes longer than 50 ms. Content filters do not exist.
+/// in the graph, unless that takes longer than 50 ms or many endpoints are created in a row. Content filters do
+/// not exist.
 ///
 /// Returns the same codes as `axon_session_publisher_create`.
 ///

@@ -1,19 +1,15 @@
 //! The graph that the session shows, as the daemon's messages change it.
 
-use std::{
-    collections::{BTreeSet, HashMap},
-    sync::Arc,
-    time::Instant,
-};
+use std::{collections::BTreeSet, sync::Arc, time::Instant};
 
 use super::pending_endpoints::PendingEndpoints;
 use crate::{
-    graph::{Endpoint, EndpointKind, GraphEntry, GraphView, Pairing, pairing},
+    graph::{Endpoint, EndpointKind, GraphEntry, Pairing, pairing},
     ids::Gid,
     session::{
         core::SessionEvent,
-        endpoint_state::{EventSource, SubscriptionInner},
-        state::SessionShared,
+        endpoint_state::EventSource,
+        state::{IndexedView, SessionShared, SessionState},
     },
     wire::session::Pair,
 };
@@ -22,10 +18,8 @@ use crate::{
 pub(super) struct GraphFollower {
     shared: Arc<SessionShared>,
     /// A full graph that is still incomplete.
-    building: Option<GraphView>,
+    building: Option<IndexedView>,
     arrivals: PendingEndpoints,
-    /// The endpoints of the graph by topic. While a full graph is incomplete, this map is about that graph.
-    topics: HashMap<String, BTreeSet<Gid>>,
     /// True if the graph changed since it was last reported.
     changed: bool,
 }
@@ -33,13 +27,7 @@ pub(super) struct GraphFollower {
 impl GraphFollower {
     /// Creates the follower of a graph that is empty yet.
     pub(super) fn new(shared: Arc<SessionShared>) -> Self {
-        Self {
-            shared,
-            building: None,
-            arrivals: PendingEndpoints::default(),
-            topics: HashMap::new(),
-            changed: false,
-        }
+        Self { shared, building: None, arrivals: PendingEndpoints::default(), changed: false }
     }
 
     /// Forgets an incomplete graph of the previous daemon.
@@ -49,8 +37,7 @@ impl GraphFollower {
 
     /// Begins a full graph, which replaces the shown one when it is complete.
     pub(super) fn begin_whole(&mut self) {
-        self.building = Some(GraphView::default());
-        self.topics.clear();
+        self.building = Some(IndexedView::default());
         self.arrivals.restart();
     }
 
@@ -73,20 +60,21 @@ impl GraphFollower {
 
     /// Sets the version up to which the daemon has sent the graph.
     pub(super) fn set_version(&mut self, version: u64) {
-        self.view(|view| view.version = version);
+        self.view(|view| view.set_version(version));
     }
 
     /// Shows the full graph that was begun, if any.
     pub(super) fn end_whole(&mut self) {
-        let Some(mut view) = self.building.take() else { return };
+        let Some(mut whole) = self.building.take() else { return };
         let mut state = self.shared.state();
         // The daemon may have sent the full graph before it received the newest endpoints.
         for own in state.shown() {
-            let entry =
-                || GraphEntry { endpoint: Arc::new(own.clone()), daemon: None, reach: None };
-            view.endpoints.entry(own.gid).or_insert_with(entry);
+            if !whole.contains(&own.gid) {
+                let endpoint = Arc::new(own.clone());
+                whole.insert(GraphEntry { endpoint, daemon: None, reach: None });
+            }
         }
-        state.graph.view = Arc::new(view);
+        state.graph.indexed = whole;
     }
 
     /// Records that the graph, or the availability of a service, changed.
@@ -137,8 +125,8 @@ impl GraphFollower {
             }
         }
         self.relate(endpoint);
-        let shown = self.building.is_some()
-            && self.shared.state().graph.view.endpoints.contains_key(&endpoint.gid);
+        let shown =
+            self.building.is_some() && self.shared.state().graph.indexed.contains(&endpoint.gid);
         let missing = if own || shown { BTreeSet::new() } else { self.missing(endpoint) };
         if missing.is_empty() {
             self.show(entry);
@@ -149,30 +137,23 @@ impl GraphFollower {
 
     fn disappear(&mut self, gid: &Gid) {
         let mut entry = self.arrivals.remove(gid);
-        self.view(|view| entry = view.endpoints.remove(gid).or(entry.take()));
+        self.view(|view| entry = view.remove(gid).or(entry.take()));
         let Some(entry) = entry else { return };
-        if let Some(gids) = self.topics.get_mut(&entry.endpoint.topic) {
-            gids.remove(gid);
-            if gids.is_empty() {
-                self.topics.remove(&entry.endpoint.topic);
-            }
-        }
-        for own in self.own(&entry.endpoint.topic) {
+        for own in self.counterparts(&entry.endpoint) {
             own.events().forget(gid);
         }
     }
 
     fn show(&mut self, entry: GraphEntry) {
         self.changed = true;
-        self.topics.entry(entry.endpoint.topic.clone()).or_default().insert(entry.endpoint.gid);
-        self.view(|view| drop(view.endpoints.insert(entry.endpoint.gid, entry)));
+        self.view(|view| view.insert(entry));
     }
 
     /// Changes the view that is being built, otherwise the one that is shown.
-    fn view(&mut self, change: impl FnOnce(&mut GraphView)) {
+    fn view(&mut self, change: impl FnOnce(&mut IndexedView)) {
         match &mut self.building {
             Some(view) => change(view),
-            None => change(Arc::make_mut(&mut self.shared.state().graph.view)),
+            None => change(&mut self.shared.state().graph.indexed),
         }
     }
 
@@ -180,7 +161,7 @@ impl GraphFollower {
     fn missing(&self, other: &Endpoint) -> BTreeSet<Pair> {
         let state = self.shared.state();
         let mut missing = BTreeSet::new();
-        for own in state.endpoints.topics.get(&other.topic).into_iter().flatten() {
+        for own in state.endpoints.topics.counterparts(other) {
             if let Some(writer) = state.endpoints.publishers.get(own)
                 && pairing(&writer.endpoint, other) == Pairing::Match
                 && !writer.events.is_matched(&other.gid)
@@ -201,29 +182,32 @@ impl GraphFollower {
     /// of this session, also reports incompatible endpoints to it. The endpoint that comes second finds the
     /// first.
     fn relate(&self, endpoint: &Endpoint) {
-        let here = self.own(&endpoint.topic);
-        // An own endpoint may have ended since it was announced. Own endpoints that began later never met
-        // it.
-        let is_own = |gid: &Gid| gid.0[..12] == self.shared.core.id.0[..12];
-        let ended = |gid: &Gid| is_own(gid) && here.iter().all(|own| own.endpoint().gid != *gid);
-        if ended(&endpoint.gid) {
-            return;
-        }
-        for source in here.iter().filter(|source| source.endpoint().gid != endpoint.gid) {
-            self.report(source, endpoint);
-        }
-        let Some(source) = here.iter().find(|source| source.endpoint().gid == endpoint.gid) else {
-            return;
-        };
-        let shown = self.shared.state().graph.view.clone();
-        let shown = self.building.as_ref().unwrap_or(&shown);
-        // Own endpoints that are not announced yet are compared when they are announced.
-        let others = self.topics.get(&endpoint.topic).into_iter().flatten();
-        let others = others.filter_map(|gid| shown.endpoints.get(gid));
-        for other in others.chain(self.arrivals.entries()) {
-            if !ended(&other.endpoint.gid) {
-                self.report(source, &other.endpoint);
+        let mut found = Vec::new();
+        let source = {
+            let state = self.shared.state();
+            // An own endpoint may have ended since it was announced. Own endpoints that began later never met
+            // it.
+            let is_own = |one: &Endpoint| one.gid.is_of(&self.shared.core.id);
+            let ended = |one: &Endpoint| is_own(one) && !state.endpoints.topics.contains(one);
+            if ended(endpoint) {
+                return;
             }
+            let source = is_own(endpoint).then(|| source(&state, &endpoint.gid)).flatten();
+            if source.is_some() {
+                // Own endpoints that are not announced yet are compared once more when they are announced.
+                let shown = self.building.as_ref().unwrap_or(&state.graph.indexed);
+                let shown = shown.counterparts(endpoint).chain(self.arrivals.entries());
+                found.extend(
+                    shown.filter(|one| !ended(&one.endpoint)).map(|one| one.endpoint.clone()),
+                );
+            }
+            source
+        };
+        for own in self.counterparts(endpoint) {
+            self.report(&own, endpoint);
+        }
+        if let Some(source) = source {
+            found.iter().for_each(|other| self.report(&source, other));
         }
     }
 
@@ -238,21 +222,20 @@ impl GraphFollower {
         }
     }
 
-    /// Returns the session's publishers and subscriptions of a topic.
-    fn own(&self, topic: &str) -> Vec<EventSource> {
+    /// Returns the session's publishers or subscriptions on the topic of `other` with whose kind it communicates.
+    fn counterparts(&self, other: &Endpoint) -> Vec<EventSource> {
         let state = self.shared.state();
-        let mut own = Vec::new();
-        for gid in state.endpoints.topics.get(topic).into_iter().flatten() {
-            let publisher = state.endpoints.publishers.get(gid);
-            if let Some(inner) = publisher.filter(|p| p.endpoint.kind == EndpointKind::Publisher) {
-                own.push(EventSource::Publisher(inner.clone()));
-            }
-            let subscription = state.endpoints.subscriptions.get(gid);
-            let is = |s: &&Arc<SubscriptionInner>| s.endpoint.kind == EndpointKind::Subscription;
-            if let Some(inner) = subscription.filter(is) {
-                own.push(EventSource::Subscription(inner.clone()));
-            }
-        }
-        own
+        state.endpoints.topics.counterparts(other).filter_map(|own| source(&state, own)).collect()
     }
+}
+
+/// Returns the session's publisher or subscription with this GID. The sides of services have no such events.
+fn source(state: &SessionState, own: &Gid) -> Option<EventSource> {
+    let publisher = state.endpoints.publishers.get(own);
+    if let Some(inner) = publisher.filter(|p| p.endpoint.kind == EndpointKind::Publisher) {
+        return Some(EventSource::Publisher(inner.clone()));
+    }
+    let subscription = state.endpoints.subscriptions.get(own);
+    let inner = subscription.filter(|s| s.endpoint.kind == EndpointKind::Subscription)?;
+    Some(EventSource::Subscription(inner.clone()))
 }

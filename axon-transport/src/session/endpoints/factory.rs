@@ -211,7 +211,7 @@ impl EndpointFactory<'_> {
         }
         let Some(endpoint) = endpoint else { return };
         if role == EndpointRole::Application {
-            state.endpoints.index(endpoint);
+            state.endpoints.topics.insert(endpoint);
         }
         shared.core.link.queue(Outgoing::Announce(endpoint.gid));
         drop(state);

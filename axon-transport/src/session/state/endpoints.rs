@@ -7,7 +7,7 @@ use std::{
 };
 
 use crate::{
-    graph::Endpoint,
+    graph::{Endpoint, TopicIndex},
     ids::Gid,
     session::{
         core::GuardCondition,
@@ -26,8 +26,8 @@ pub(in crate::session) struct OwnEndpoints {
     pub(in crate::session) subscriptions: HashMap<Gid, Arc<SubscriptionInner>>,
     /// Publishers that the application has dropped, each with the time until which it stays at most.
     pub(in crate::session) leaving: BTreeMap<Gid, Instant>,
-    /// Applications' endpoints of both kinds by topic or service.
-    pub(in crate::session) topics: HashMap<String, BTreeSet<Gid>>,
+    /// Applications' endpoints by topic or service.
+    pub(in crate::session) topics: TopicIndex,
 }
 
 impl OwnEndpoints {
@@ -63,18 +63,5 @@ impl OwnEndpoints {
     pub(in crate::session) fn gids(&self) -> BTreeSet<Gid> {
         let endpoints = self.publishers.keys().chain(self.subscriptions.keys());
         self.nodes.keys().chain(endpoints).copied().collect()
-    }
-
-    pub(in crate::session) fn index(&mut self, endpoint: &Endpoint) {
-        self.topics.entry(endpoint.topic.clone()).or_default().insert(endpoint.gid);
-    }
-
-    pub(in crate::session) fn unindex(&mut self, endpoint: &Endpoint) {
-        if let Some(gids) = self.topics.get_mut(&endpoint.topic) {
-            gids.remove(&endpoint.gid);
-            if gids.is_empty() {
-                self.topics.remove(&endpoint.topic);
-            }
-        }
     }
 }

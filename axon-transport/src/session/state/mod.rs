@@ -18,6 +18,7 @@ use std::{
 
 use axon_shm::internal::SessionSegment;
 
+pub(in crate::session) use self::graph::IndexedView;
 #[cfg(feature = "sros2")]
 pub(in crate::session) use self::permit::check_domain;
 use self::{endpoints::OwnEndpoints, graph::ShownGraph, pair_waits::PairWaits, unmet::UnmetPairs};

@@ -62,10 +62,10 @@ impl SessionShared {
         let state = self.state();
         let (writer, reader) =
             (state.endpoints.publishers.get(own), state.endpoints.subscriptions.get(own));
-        let topic = writer.map(|w| &w.endpoint).or(reader.map(|r| &r.endpoint)).map(|e| &e.topic);
-        let others = topic.and_then(|topic| state.endpoints.topics.get(topic));
+        let endpoint = writer.map(|w| &w.endpoint).or(reader.map(|r| &r.endpoint));
+        let others = endpoint.into_iter().flat_map(|own| state.endpoints.topics.counterparts(own));
         let mut pairs = Vec::new();
-        for other in others.into_iter().flatten().filter(|other| *other != own) {
+        for other in others {
             let out = (writer, state.endpoints.subscriptions.get(other));
             let back = (state.endpoints.publishers.get(other), reader);
             for (writer, reader) in [out, back] {
@@ -127,13 +127,13 @@ impl SessionShared {
                 link.queue(Outgoing::gone(*gid))
             }
             Some((endpoint, EndpointRole::Application)) => {
-                state.endpoints.unindex(endpoint);
+                state.endpoints.topics.remove(endpoint);
                 if stays {
                     state.graph.hide(gid);
                 } else {
                     state.remove_dead(gid, link);
                 }
-                for other in state.endpoints.topics.get(&endpoint.topic).into_iter().flatten() {
+                for other in state.endpoints.topics.counterparts(endpoint) {
                     others.extend(
                         state.endpoints.publishers.get(other).cloned().map(EventSource::Publisher),
                     );

@@ -1,6 +1,6 @@
-//! Limits how long new endpoints wait for endpoints of other hosts. For one endpoint, the wait is convenient; a
-//! thousand endpoints that are created one after the other would keep their program waiting for a minute, while they
-//! could be matched together.
+//! Limits how long new endpoints wait for their pairs. For one endpoint, the wait is convenient; a thousand endpoints that
+//! are created one after the other would keep their program waiting for seconds on a busy host, and for a minute where
+//! other hosts are involved, while they could be matched together.
 //!
 //! Plain data.
 
@@ -8,26 +8,43 @@ use std::time::{Duration, Instant};
 
 /// Pairs on one host take less than this.
 const LOCAL_PAIR_TIME: Duration = Duration::from_millis(5);
-/// Factor for the pause after a longer wait: for so many times its duration, other endpoints do not wait.
+/// Factor for the pause after waiting: for so many times its duration, other endpoints do not wait.
 const PAUSE_FACTOR: u32 = 9;
+/// The time that endpoints may wait one after the other before the pause applies to pairs on one host.
+const ALLOWANCE: Duration = Duration::from_millis(100);
 
 /// The waits of one session.
 #[derive(Debug, Default)]
 pub(super) struct PairWaits {
     not_before: Option<Instant>,
+    /// The time that was waited and that pauses have not paid off, at the time of the last wait.
+    owed: Option<(Duration, Instant)>,
 }
 
 impl PairWaits {
-    /// Returns whether a new endpoint waits for endpoints of other hosts now.
+    /// Returns whether a new endpoint waits at all now.
     pub(super) fn are_due(&self, now: Instant) -> bool {
+        self.owed_at(now) < ALLOWANCE
+    }
+
+    /// Returns whether a new endpoint also waits for endpoints of other hosts now.
+    pub(super) fn are_due_far(&self, now: Instant) -> bool {
         self.not_before.is_none_or(|due| due <= now)
     }
 
-    /// Records that an endpoint has waited for this time.
-    pub(super) fn waited(&mut self, time: Duration, now: Instant) {
-        if time > LOCAL_PAIR_TIME {
+    /// Records that an endpoint has waited for this time; `far` if for an endpoint of another host.
+    pub(super) fn waited(&mut self, time: Duration, far: bool, now: Instant) {
+        self.owed = Some((self.owed_at(now) + time, now));
+        if far && time > LOCAL_PAIR_TIME {
             self.not_before = Some(now + PAUSE_FACTOR * time);
         }
+    }
+
+    fn owed_at(&self, now: Instant) -> Duration {
+        let owed = |(owed, at): (Duration, Instant)| {
+            owed.saturating_sub(now.saturating_duration_since(at) / PAUSE_FACTOR)
+        };
+        self.owed.map(owed).unwrap_or_default()
     }
 }
 
@@ -35,30 +52,50 @@ impl PairWaits {
 mod tests {
     use super::*;
 
-    #[test]
-    fn endpoints_wait_a_tenth_of_the_time_where_each_takes_long() {
+    /// Creates endpoints that take `time` if they wait, otherwise a millisecond. Returns the number of those that
+    /// waited.
+    fn waited(endpoints: usize, time: Duration, far: bool) -> usize {
         let (mut waits, mut now) = (PairWaits::default(), Instant::now());
         let mut waited = 0;
-        // Each endpoint takes a millisecond, or fifty if it waits.
-        for _ in 0..1000 {
-            if waits.are_due(now) {
-                let time = Duration::from_millis(50);
+        for _ in 0..endpoints {
+            if waits.are_due(now) && (!far || waits.are_due_far(now)) {
                 now += time;
-                waits.waited(time, now);
+                waits.waited(time, far, now);
                 waited += 1;
             }
             now += Duration::from_millis(1);
         }
-        assert_eq!(waited, 3);
+        waited
+    }
+
+    #[test]
+    fn far_endpoints_wait_a_tenth_of_the_time_where_each_takes_long() {
+        assert_eq!(waited(1000, Duration::from_millis(50), true), 3);
     }
 
     #[test]
     fn endpoints_wait_each_time_where_that_is_short() {
-        let (mut waits, mut now) = (PairWaits::default(), Instant::now());
-        for _ in 0..1000 {
-            assert!(waits.are_due(now));
-            now += LOCAL_PAIR_TIME;
-            waits.waited(LOCAL_PAIR_TIME, now);
-        }
+        assert_eq!(waited(1000, Duration::from_micros(100), false), 1000);
+        assert_eq!(waited(20, LOCAL_PAIR_TIME, false), 20);
+        assert_eq!(waited(20, LOCAL_PAIR_TIME, true), 20);
+    }
+
+    #[test]
+    fn near_endpoints_wait_for_the_allowance_and_then_a_tenth_of_the_time() {
+        let time = Duration::from_millis(2);
+        let waited = waited(1000, time, false) as u32;
+        let whole = Duration::from_secs(1) + waited * time;
+        assert!(waited * time <= ALLOWANCE + whole / PAUSE_FACTOR + time, "{waited} waited");
+        assert!(waited >= 50, "the allowance is used: {waited}");
+    }
+
+    #[test]
+    fn the_allowance_comes_back() {
+        let (mut waits, now) = (PairWaits::default(), Instant::now());
+        waits.waited(ALLOWANCE, false, now);
+        assert!(!waits.are_due(now));
+        assert!(waits.are_due(now + Duration::from_millis(10)));
+        waits.waited(ALLOWANCE, false, now + PAUSE_FACTOR * ALLOWANCE);
+        assert!(!waits.are_due(now + PAUSE_FACTOR * ALLOWANCE), "it is not saved up");
     }
 }
