@@ -11,7 +11,10 @@ use std::{
     sync::Arc,
 };
 
-use axon_shm::ids::{DaemonId, Gid};
+use axon_shm::{
+    ids::{DaemonId, Gid},
+    internal::KnownPeers,
+};
 use axon_transport::{
     access::AccessRules,
     config::{Config, TopicRule},
@@ -45,6 +48,8 @@ pub struct GatewayParts {
     pub daemon_key: Option<Arc<DaemonKey>>,
     /// The keys of the sessions. With them the gateway proves to peers that the sessions belong to this daemon.
     pub keys: Arc<SessionKeys>,
+    /// The descriptors of the sessions that the control plane holds.
+    pub known_peers: Arc<KnownPeers>,
     /// The gateway's end of a socket pair, for [`Session::over`](axon_transport::Session::over).
     pub socket: OwnedFd,
     /// Sender to the control plane.

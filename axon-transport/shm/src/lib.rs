@@ -78,6 +78,7 @@ pub mod internal {
             window::holds,
         },
         session::{
+            known_peers::KnownPeers,
             lane::Lane,
             peer::{PeerDescriptors, PeerSession, RingPeer},
             reader_info::{ReaderInfo, Terms},

@@ -2,6 +2,8 @@
 
 use std::{ffi::OsString, io, path::PathBuf, sync::Arc};
 
+use axon_shm::internal::KnownPeers;
+
 #[cfg(feature = "sros2")]
 use crate::sros2::EnclavePermissions;
 use crate::{qos::Qos, session_key::SessionKey, wire::session::SessionRole};
@@ -28,6 +30,8 @@ pub struct SessionOptions {
     pub(in crate::session) callers: usize,
     /// True if the session keeps refusals that concern no particular endpoint, for the process that it relays.
     pub(in crate::session) keeps_refusals: bool,
+    /// The descriptors of other sessions that this process holds already.
+    pub(in crate::session) known_peers: Option<Arc<KnownPeers>>,
     /// The key that the session's id is derived from.
     pub(in crate::session) key: Option<Arc<SessionKey>>,
     #[cfg(feature = "sros2")]
@@ -49,6 +53,7 @@ impl SessionOptions {
             daemon_command: None,
             callers: usize::MAX,
             keeps_refusals: false,
+            known_peers: None,
             key: None,
             #[cfg(feature = "sros2")]
             permissions: None,

@@ -7,6 +7,7 @@ mod anybody;
 mod churn;
 mod cut;
 mod delivery;
+mod descriptors;
 mod dhe;
 mod disagree;
 mod dropped;

@@ -12,10 +12,8 @@ use axon_transport::internal::{
 };
 use rustix::event::{EventfdFlags, eventfd};
 
-/// Descriptors of a session: its connection, segment, doorbell and pidfd.
+/// Descriptors of a session: its connection, segment, doorbell and pidfd. The gateway shares the latter two.
 const OF_SESSION: u64 = 4;
-/// Descriptors of a session in the gateway, once another host uses one of its endpoints: its doorbell and pidfd.
-const IN_GATEWAY: u64 = 2;
 /// Descriptors of a relayed session: its connection, a socket pair, and those that a session in this process opens.
 const OF_RELAYED: u64 = 24;
 /// Number of descriptors that stay free for links, key requests, files and callers; at most a sixth of the limit.
@@ -30,8 +28,6 @@ pub(super) struct DescriptorRoom {
     limit: u64,
     /// Number of open descriptors.
     open: u64,
-    /// Number of descriptors that the gateway may still open for the present sessions.
-    owed: u64,
     /// Number of sessions with descriptors, without the gateway's own.
     sessions: usize,
     /// Number of descriptors held for the sessions of one process.
@@ -42,18 +38,11 @@ impl DescriptorRoom {
     /// Computes the use for process `pid`. Returns `None` if there is no limit.
     pub(super) fn of<F: Clone>(registry: &Registry<F>, pid: u32) -> Option<Self> {
         let limit = descriptors::limit()?;
-        let mut room = Self { limit, open: descriptors::open(), owed: 0, sessions: 0, held: 0 };
-        let mut gateway = None;
+        let mut room = Self { limit, open: descriptors::open(), sessions: 0, held: 0 };
         for (_, entry) in registry.sessions() {
-            match entry.role {
-                SessionRole::Gateway => gateway = Some(entry),
-                SessionRole::Tool => {}
-                SessionRole::Application => room.add(entry, pid),
+            if entry.role == SessionRole::Application {
+                room.add(entry, pid);
             }
-        }
-        if let Some(gateway) = gateway {
-            let met = gateway.holds_memory_of().min(room.sessions);
-            room.owed = IN_GATEWAY * (room.sessions - met) as u64;
         }
         Some(room)
     }
@@ -62,13 +51,13 @@ impl DescriptorRoom {
         self.sessions += 1;
         if entry.pid == pid {
             let own = if entry.relay.is_some() { OF_RELAYED } else { OF_SESSION };
-            self.held += own + IN_GATEWAY + entry.segments.len() as u64;
+            self.held += own + entry.segments.len() as u64;
         }
     }
 
     /// Returns the number of descriptors that no session may take.
     fn kept(&self) -> u64 {
-        self.owed + RESERVED_DESCRIPTORS.min(self.limit / 6)
+        RESERVED_DESCRIPTORS.min(self.limit / 6)
     }
 
     /// Returns the number of descriptors that sessions may still take.
@@ -78,7 +67,7 @@ impl DescriptorRoom {
 
     /// Returns the reason why there is no descriptor for another session, if so.
     pub(super) fn refuses_session(&self, is_relayed: bool) -> Option<String> {
-        self.refuses(if is_relayed { OF_RELAYED } else { OF_SESSION } + IN_GATEWAY)
+        self.refuses(if is_relayed { OF_RELAYED } else { OF_SESSION })
     }
 
     /// Returns the reason why there is no descriptor for another segment of a session, if so.
@@ -156,18 +145,16 @@ mod tests {
     use super::*;
 
     fn room(limit: u64, open: u64, held: u64) -> DescriptorRoom {
-        DescriptorRoom { limit, open, owed: 0, sessions: 9, held }
+        DescriptorRoom { limit, open, sessions: 9, held }
     }
 
     #[test]
     fn session_is_refused_when_it_would_use_reserved_descriptors() {
-        let last = 1024 - RESERVED_DESCRIPTORS - OF_SESSION - IN_GATEWAY;
+        let last = 1024 - RESERVED_DESCRIPTORS - OF_SESSION;
         assert_eq!(room(1024, last, 0).refuses_session(false), None);
         let text = room(1024, last + 1, 0).refuses_session(false).unwrap();
         assert!(text.contains("of its 1024 file descriptors open, for 9 sessions"), "{text}");
         assert!(room(1024, last, 0).refuses_session(true).is_some(), "a relayed one takes more");
-        let owed = DescriptorRoom { owed: 1, ..room(1024, last, 0) };
-        assert!(owed.refuses_session(false).is_some(), "the gateway needs it");
         assert!(room(20, 60, 0).refuses_segment().is_some(), "the limit was lowered");
         assert_eq!(room(u64::MAX, 60, 1 << 20).refuses_segment(), None);
     }

@@ -60,6 +60,7 @@ impl RunningGateway {
                 daemon: control.id,
                 daemon_key: control.daemon_key.clone(),
                 keys: Arc::clone(&control.keys_of_sessions),
+                known_peers: Arc::clone(&control.known_peers),
                 socket: theirs,
                 control: to_control,
                 orders: from_control,

@@ -404,6 +404,7 @@ fn admit(
         None => None,
     };
     let scope = (!gateway).then(|| scope_of(&hello));
+    let known = handed.clone();
     let SessionHello { session, role, name, .. } = hello;
     tracing::debug!(%session, name, pid, "a session");
     if let Err(violation) =
@@ -411,6 +412,9 @@ fn admit(
     {
         refuse(control, socket, &name, peer, SessionRefused::because(violation.to_string()));
         return None;
+    }
+    if let Some([_, doorbell, pidfd]) = known.filter(|_| !gateway) {
+        control.known_peers.insert(session, &doorbell, &pidfd);
     }
     // Access rules decide what another user may do.
     if control.admission.is_another(uid) {
@@ -431,6 +435,7 @@ fn admit(
     if !say(socket, SessionMessage::Welcome(welcome), &probe) {
         control.registry.handle_disconnect(&session);
         control.keys_of_sessions.remove(&session);
+        control.known_peers.remove(&session);
         control.settle();
         return None;
     }

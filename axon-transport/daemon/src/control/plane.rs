@@ -16,7 +16,7 @@ use std::{
 
 use axon_shm::{
     ids::{DaemonId, SessionId},
-    internal::{descriptors::PassedFd, probe},
+    internal::{KnownPeers, descriptors::PassedFd, probe},
 };
 use axon_transport::{
     config::Config,
@@ -76,6 +76,8 @@ pub(super) struct ControlPlane {
     pub(super) gateway: String,
     /// The sessions' own keys, with which the gateway proves that they are this daemon's.
     pub(super) keys_of_sessions: Arc<SessionKeys>,
+    /// The sessions' descriptors, which the gateway uses in place of its copies.
+    pub(super) known_peers: Arc<KnownPeers>,
     /// The memory for samples that arrive over relays.
     pub(super) pool: Arc<ArrivalPool>,
     /// Memory with which sessions check that they can map the daemon's memory.
@@ -140,6 +142,7 @@ impl ControlPlane {
             port: None,
             gateway: "off".into(),
             keys_of_sessions: Arc::default(),
+            known_peers: Arc::default(),
             pool: ArrivalPool::new(config.reliable_queue),
             probe: probe()
                 .inspect_err(
@@ -180,6 +183,7 @@ impl ControlPlane {
         if !self.is_current(id, bell) {
             return false;
         }
+        self.known_peers.remove(id);
         let more = self.registry.handle_hang_up_in_parts(id);
         if !more {
             self.wakers.remove(id);
@@ -194,6 +198,7 @@ impl ControlPlane {
         if let Some(bell) = self.wakers.remove(id) {
             bell.notify_one();
         }
+        self.known_peers.remove(id);
         while self.registry.handle_hang_up_in_parts(id) {}
         self.keys_of_sessions.remove(id);
     }

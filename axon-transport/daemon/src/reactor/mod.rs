@@ -77,7 +77,8 @@ async fn serve(
     kme: Option<(crate::keys::Kme, crate::keys::UsedKeys)>,
     key_events: Option<Events>,
 ) -> Result<(), GatewayError> {
-    let GatewayParts { config, daemon, daemon_key, keys, socket, control, orders } = parts;
+    let GatewayParts { config, daemon, daemon_key, keys, known_peers, socket, control, orders } =
+        parts;
     let mut hello = LinkHello::new(&config, daemon);
     hello.routes = u32::try_from(MAX_ROUTES).ok();
     let identity = match &config.security {
@@ -89,7 +90,7 @@ async fn serve(
     }
     let sockets = Sockets::bind(&config)?;
     let port = sockets.port();
-    let (session, notices) = session::open(socket, &config)?;
+    let (session, notices) = session::open(socket, &config, known_peers)?;
     let rings = ShmRings::new(session.clone())?;
     let reset = bind::reset_key(config.runtime_dir.as_deref(), config.domain);
     let mut of_session = [0; 12];

@@ -8,6 +8,7 @@ use std::{
     },
 };
 
+use axon_shm::internal::KnownPeers;
 use axon_transport::{
     Session, SessionError, SessionEvent, SessionOptions,
     config::Config,
@@ -59,8 +60,9 @@ impl Notices {
 pub(super) fn open(
     socket: OwnedFd,
     config: &Config,
+    known: Arc<KnownPeers>,
 ) -> Result<(Session, Arc<Notices>), SessionError> {
-    let options = SessionOptions::new("gateway").role(SessionRole::Gateway);
+    let options = SessionOptions::new("gateway").role(SessionRole::Gateway).known_peers(known);
     let session = Session::over(socket, config, options)?;
     let notices = Arc::new(Notices::default());
     let noted = Arc::clone(&notices);

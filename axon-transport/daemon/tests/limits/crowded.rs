@@ -53,8 +53,8 @@ fn session_beyond_the_descriptor_limit_is_told_the_numbers_and_the_setting() {
     limit(&daemon, 256);
     let (mut served, said) = crowd(&host, 64);
     is_told(&said, 256);
-    // Of 256 descriptors a session takes four, and two more are kept for the gateway.
-    assert!(served.len() >= 20, "{} sessions are served", served.len());
+    // Of 256 descriptors a session takes four; the gateway needs none for it.
+    assert!(served.len() >= 32, "{} sessions are served", served.len());
 
     let status = host.status().expect("a tool is served");
     let descriptors = status.descriptors.expect("they are counted");

@@ -9,7 +9,7 @@ use std::{
     io::{self, IoSliceMut},
     mem::MaybeUninit,
     os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd, RawFd},
-    sync::atomic::Ordering,
+    sync::{Arc, atomic::Ordering},
 };
 
 use rustix::{
@@ -37,8 +37,8 @@ const RESERVE: u64 = 400;
 /// A descriptor to be sent to another process, or [received](Self::received) from one. Dropping a received one does not
 /// make the dropping thread wait for the close.
 pub struct PassedFd {
-    /// `None` only while it is dropped.
-    fd: Option<OwnedFd>,
+    /// `None` only while it is dropped. Owned together with the values that [`share`](Self::share) returned.
+    fd: Option<Arc<OwnedFd>>,
     origin: FdOrigin,
 }
 
@@ -73,7 +73,7 @@ impl PassedFd {
         // The counter guards nothing: the functions that read it may miss descriptors that are opened or closed at the
         // moment.
         OPEN.fetch_add(1, Ordering::Relaxed);
-        Self { fd: Some(fd), origin }
+        Self { fd: Some(Arc::new(fd)), origin }
     }
 
     /// Duplicates the descriptor.
@@ -81,12 +81,22 @@ impl PassedFd {
     /// # Errors
     /// The process has no descriptors left.
     pub fn try_clone(&self) -> io::Result<Self> {
-        let origin = match self.origin {
-            // The connection must not end with a duplicate of its descriptor.
+        Ok(Self::new(self.as_fd().try_clone_to_owned()?, self.origin_of_copy()))
+    }
+
+    /// Returns the same descriptor once more, within this process: it takes no further one, and is closed with the
+    /// last of its values.
+    #[must_use]
+    pub fn share(&self) -> Self {
+        Self { fd: self.fd.clone(), origin: self.origin_of_copy() }
+    }
+
+    fn origin_of_copy(&self) -> FdOrigin {
+        match self.origin {
+            // The connection must not end with a copy of its descriptor.
             FdOrigin::Connection(_) => FdOrigin::Passed,
             origin => origin,
-        };
-        Ok(Self::new(self.as_fd().try_clone_to_owned()?, origin))
+        }
     }
 
     /// Returns whether it is memory that can be sealed, or a file of a tmpfs, which is as good. Calls no file system.
@@ -155,7 +165,8 @@ impl Drop for PassedFd {
             let _ = shutdown(&*self, Shutdown::Both);
         }
         let lane = self.lane();
-        let Some(fd) = self.fd.take() else { return };
+        // Another value shares it: that one closes it.
+        let Some(fd) = self.fd.take().and_then(Arc::into_inner) else { return };
         match lane {
             Some(lane) => lane.close(fd),
             None => {
@@ -409,6 +420,28 @@ pub(crate) mod tests {
         let (ours, theirs) = pair();
         drop(PassedFd::received(ours));
         await_end(&theirs);
+    }
+
+    #[test]
+    fn shared_descriptor_is_closed_with_its_last_value() {
+        let (ours, theirs) = pair();
+        let number = ours.as_raw_fd();
+        let first = PassedFd::received(ours);
+        let second = first.share();
+        assert_eq!(second.as_raw_fd(), number, "no further descriptor");
+        drop(first);
+        rustix::io::write(&second, b"x").unwrap();
+        let mut byte = [0];
+        assert_eq!(rustix::io::read(&theirs, &mut byte), Ok(1));
+        drop(second);
+        await_end(&theirs);
+        // The end of a connection is not put off by a shared value.
+        let (ours, theirs) = pair();
+        let connection = PassedFd::connection(ours).trusted();
+        let shared = connection.share();
+        drop(connection);
+        await_end(&theirs);
+        drop(shared);
     }
 
     #[test]

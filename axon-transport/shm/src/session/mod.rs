@@ -2,6 +2,7 @@
 
 pub(crate) mod activity;
 pub(crate) mod attachment;
+pub(crate) mod known_peers;
 pub(crate) mod lane;
 pub(crate) mod leader;
 pub(crate) mod orphans;

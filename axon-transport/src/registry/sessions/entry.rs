@@ -87,11 +87,6 @@ impl<F> SessionEntry<F> {
         self.refused_endpoints.values().map(|(endpoint, why)| (endpoint, &**why))
     }
 
-    /// Of how many sessions it holds memory.
-    pub fn holds_memory_of(&self) -> usize {
-        self.held.len()
-    }
-
     /// Its range, and the daemons of linked peers that it lists; `None` where ranges do not apply.
     pub(in crate::registry) fn reach(&self) -> Option<EndpointRange> {
         let scope = self.scope.as_ref()?;

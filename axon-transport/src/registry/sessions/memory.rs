@@ -119,11 +119,6 @@ impl HeldMemory {
         first
     }
 
-    /// Of how many sessions it holds memory.
-    pub(in crate::registry) fn len(&self) -> usize {
-        self.0.len()
-    }
-
     /// A pair is over. With the last one the session lets go of the other's memory.
     pub(super) fn forget(&mut self, of: &SessionId, pair: &Pair) {
         if let Some(held) = self.0.get_mut(of) {

@@ -111,8 +111,10 @@ impl ControlThread {
     ) -> Result<Self, SessionError> {
         let reconnects = matches!(start, FirstPeer::Daemon(_));
         shared.core.segment.is_watched();
-        let peers = Peers::new(shared.core.segment.clone(), shared.core.memory.clone())
-            .map_err(ShmError::system("watching processes"))?;
+        let (segment, memory) = (shared.core.segment.clone(), shared.core.memory.clone());
+        let known = shared.core.options.known_peers.clone();
+        let peers =
+            Peers::new(segment, memory, known).map_err(ShmError::system("watching processes"))?;
         let mut control = Self {
             graph: GraphFollower::new(Arc::clone(&shared)),
             matches: ChangedMatches::new(Arc::clone(&shared)),

@@ -14,8 +14,8 @@ use std::{
 use axon_shm::{
     ShmError,
     internal::{
-        PeerDescriptors, PeerSession, RingPeer, SegmentInfo, SegmentKind, SessionSegment,
-        descriptors::PassedFd,
+        KnownPeers, PeerDescriptors, PeerSession, RingPeer, SegmentInfo, SegmentKind,
+        SessionSegment, descriptors::PassedFd,
     },
 };
 use rustix::{
@@ -32,6 +32,8 @@ use crate::{
 pub(super) struct Peers {
     own: Arc<SessionSegment>,
     news: Arc<MemoryChanges>,
+    /// The sessions whose descriptors this process holds already, if it is their daemon.
+    known: Option<Arc<KnownPeers>>,
     peers: HashMap<SessionId, Entry>,
     held: PairRefs,
     /// An epoll instance of the peers' pidfds. With hundreds of peers, checking each of them at every event would be
@@ -149,9 +151,13 @@ pub(super) enum PeerError {
 }
 
 impl Peers {
-    pub(super) fn new(own: Arc<SessionSegment>, news: Arc<MemoryChanges>) -> Result<Self, Errno> {
+    pub(super) fn new(
+        own: Arc<SessionSegment>,
+        news: Arc<MemoryChanges>,
+        known: Option<Arc<KnownPeers>>,
+    ) -> Result<Self, Errno> {
         let deaths = Arc::new(epoll::create(epoll::CreateFlags::CLOEXEC)?);
-        Ok(Self { own, news, peers: HashMap::new(), held: PairRefs::default(), deaths })
+        Ok(Self { own, news, known, peers: HashMap::new(), held: PairRefs::default(), deaths })
     }
 
     /// Returns the session `id`, and holds it for `pair`. `descriptors` begins with those of the session's
@@ -173,7 +179,10 @@ impl Peers {
         if returned || !self.peers.contains_key(&id) {
             let [segment, doorbell, pidfd] =
                 <[PassedFd; 3]>::try_from(descriptors).map_err(|_| PeerError::Missing)?;
-            let descriptors = PeerDescriptors { segment, doorbell, pidfd };
+            let mut descriptors = PeerDescriptors { segment, doorbell, pidfd };
+            if let Some(known) = &self.known {
+                known.replace(&id, &mut descriptors);
+            }
             let session = PeerSession::map_among(id, descriptors, self.sessions())?;
             let news = self.news.clone();
             session.on_wanted(move || news.want(id));

@@ -9,7 +9,10 @@ use std::{
     time::{Duration, SystemTime},
 };
 
-use axon_shm::{Meta, PublishError, Sample, internal::SessionSegment};
+use axon_shm::{
+    Meta, PublishError, Sample,
+    internal::{KnownPeers, SessionSegment},
+};
 
 use super::Node;
 use crate::{
@@ -139,6 +142,14 @@ impl SessionOptions {
     #[must_use]
     pub fn keep_refusals(mut self) -> Self {
         self.keeps_refusals = true;
+        self
+    }
+
+    /// Sets the descriptors of other sessions that this process holds already. The session uses them in place of
+    /// copies that it receives.
+    #[must_use]
+    pub fn known_peers(mut self, known: Arc<KnownPeers>) -> Self {
+        self.known_peers = Some(known);
         self
     }
 
