@@ -6,21 +6,13 @@
 use std::{io, sync::Arc};
 
 use axon_shm::internal::descriptors::PassedFd;
-use tokio::io::{Interest, unix::AsyncFd};
+use tokio::io::unix::AsyncFd;
 
 /// Has the current runtime watch a descriptor.
 pub(crate) fn watch(fd: impl Into<PassedFd>) -> io::Result<AsyncFd<PassedFd>> {
-    watch_for(fd, Interest::READABLE | Interest::WRITABLE)
-}
-
-/// Has the current runtime watch a descriptor for these events alone.
-pub(crate) fn watch_for(
-    fd: impl Into<PassedFd>,
-    interest: Interest,
-) -> io::Result<AsyncFd<PassedFd>> {
     // SAFETY: a `PassedFd` is always the same open descriptor, no other code closes it, and
     // `AsyncFd` removes it from the reactor before it drops it.
-    unsafe { AsyncFd::register_with_interest(fd.into(), interest) }.map_err(Into::into)
+    unsafe { AsyncFd::register(fd.into()) }.map_err(Into::into)
 }
 
 /// Has the current runtime watch a descriptor that other code holds as well.

@@ -2,19 +2,17 @@
 
 use std::{
     io::{self, IoSliceMut},
-    net::{IpAddr, SocketAddr, UdpSocket},
-    os::fd::{AsFd, OwnedFd},
+    net::{IpAddr, SocketAddr},
     task::{Context, Poll},
 };
 
-use axon_shm::internal::descriptors::PassedFd;
 use axon_transport::config::Config;
 use bytes::BytesMut;
 use quinn_proto::{EcnCodepoint, Transmit};
 use quinn_udp::{RecvMeta, UdpSockRef, UdpSocketState};
-use tokio::io::{Interest, unix::AsyncFd};
+use tokio::{io::Interest, net::UdpSocket};
 
-use crate::{async_fd::watch_for, error::EndpointError, reactor::bind::bind_daemon};
+use crate::{error::EndpointError, reactor::bind::bind_daemon};
 
 /// Messages that one system call receives. Each holds as many datagrams as the kernel coalesced.
 const MESSAGES: usize = 8;
@@ -42,24 +40,14 @@ pub(super) struct Sockets {
     port: u16,
     buffer: Vec<u8>,
     mtu: usize,
-    held: Option<HeldPackets>,
+    /// Packets that found the buffer of their socket full.
+    held: Option<(usize, Transmit, Vec<u8>)>,
 }
 
 struct Socket {
     address: SocketAddr,
-    /// Watched for datagrams alone. The kernel reports room in the send buffer after each packet, which would wake the
-    /// thread for nothing.
-    io: AsyncFd<PassedFd>,
+    io: UdpSocket,
     state: UdpSocketState,
-}
-
-/// Packets that found the buffer of their socket full.
-struct HeldPackets {
-    socket: usize,
-    transmit: Transmit,
-    bytes: Vec<u8>,
-    /// The socket, watched for room in its buffer.
-    room: AsyncFd<PassedFd>,
 }
 
 impl Sockets {
@@ -69,7 +57,10 @@ impl Sockets {
     /// No port of the domain can be bound.
     pub(super) fn bind(config: &Config) -> Result<Self, EndpointError> {
         let (port, bound) = bind_daemon(config)?;
-        let all = bound.into_iter().map(|(address, socket)| Socket::new(address, socket));
+        let all = bound.into_iter().map(|(address, socket)| {
+            let state = UdpSocketState::new(UdpSockRef::from(&socket))?;
+            Ok(Socket { address, io: UdpSocket::from_std(socket)?, state })
+        });
         Ok(Self {
             all: all.collect::<io::Result<_>>()?,
             port,
@@ -128,31 +119,18 @@ impl Sockets {
     /// Sends packets. If the socket takes none now, they are kept, and nothing more may be sent until
     /// [`flush`](Self::flush) returns true.
     pub(super) fn send(&mut self, socket: usize, transmit: Transmit, bytes: &[u8]) {
-        if is_full(&self.all[socket].send(&transmit, bytes)) {
-            self.hold(socket, transmit, bytes);
-        }
-    }
-
-    /// Keeps packets until their socket has room. If nothing tells of the room, they are lost, and QUIC repeats them.
-    fn hold(&mut self, socket: usize, transmit: Transmit, bytes: &[u8]) {
-        match self.all[socket].watch_for_room() {
-            Ok(room) => {
-                let bytes = bytes[..transmit.size].to_vec();
-                self.held = Some(HeldPackets { socket, transmit, bytes, room });
-            }
-            Err(error) => {
-                tracing::debug!(%error, "cannot watch a full UDP socket: its packets are lost")
-            }
+        if !self.all[socket].send(&transmit, bytes) {
+            let bytes = bytes[..transmit.size].to_vec();
+            self.held = Some((socket, transmit, bytes));
         }
     }
 
     /// Sends packets that were kept. Returns whether none is left.
     pub(super) fn flush(&mut self) -> bool {
-        if let Some(HeldPackets { socket, transmit, bytes, room }) = &self.held {
-            let send = |_: &PassedFd| self.all[*socket].send(transmit, bytes);
-            if !is_full(&room.try_io(Interest::WRITABLE, send)) {
-                self.held = None;
-            }
+        if let Some((socket, transmit, bytes)) = &self.held
+            && self.all[*socket].send(transmit, bytes)
+        {
+            self.held = None;
         }
         self.held.is_none()
     }
@@ -161,12 +139,12 @@ impl Sockets {
     pub(super) fn poll_ready(&self, cx: &mut Context<'_>) -> Poll<()> {
         let mut ready = Poll::Pending;
         for socket in &self.all {
-            if socket.io.poll_read_ready(cx).is_ready() {
+            if socket.io.poll_recv_ready(cx).is_ready() {
                 ready = Poll::Ready(());
             }
         }
-        if let Some(held) = &self.held
-            && held.room.poll_write_ready(cx).is_ready()
+        if let Some((socket, ..)) = &self.held
+            && self.all[*socket].io.poll_send_ready(cx).is_ready()
         {
             ready = Poll::Ready(());
         }
@@ -175,30 +153,20 @@ impl Sockets {
 }
 
 impl Socket {
-    fn new(address: SocketAddr, socket: UdpSocket) -> io::Result<Self> {
-        let state = UdpSocketState::new(UdpSockRef::from(&socket))?;
-        Ok(Self { address, io: watch_for(OwnedFd::from(socket), Interest::READABLE)?, state })
-    }
-
-    /// A further descriptor of the socket, watched for room in its buffer.
-    fn watch_for_room(&self) -> io::Result<AsyncFd<PassedFd>> {
-        watch_for(self.io.get_ref().as_fd().try_clone_to_owned()?, Interest::WRITABLE)
-    }
-
     /// Receives messages. Returns how many.
     fn receive(&self, buffer: &mut [u8], metas: &mut [RecvMeta; MESSAGES]) -> usize {
         let mut chunks = buffer.chunks_mut(MESSAGE);
         let mut slices: [IoSliceMut<'_>; MESSAGES] =
             std::array::from_fn(|_| IoSliceMut::new(chunks.next().unwrap_or_default()));
-        let received = self.io.try_io(Interest::READABLE, |socket| {
+        let received = self.io.try_io(Interest::READABLE, || {
             // An error is of one packet that was sent. It must not have the loop read again and again.
-            self.state.recv(UdpSockRef::from(socket), &mut slices, metas).map_err(would_block)
+            self.state.recv(UdpSockRef::from(&self.io), &mut slices, metas).map_err(would_block)
         });
         received.unwrap_or(0)
     }
 
-    /// Sends packets.
-    fn send(&self, transmit: &Transmit, bytes: &[u8]) -> io::Result<()> {
+    /// Sends packets. Returns false if the socket takes none now.
+    fn send(&self, transmit: &Transmit, bytes: &[u8]) -> bool {
         let transmit = quinn_udp::Transmit {
             destination: transmit.destination,
             ecn: transmit.ecn.and_then(|ecn| quinn_udp::EcnCodepoint::from_bits(ecn as u8)),
@@ -206,13 +174,12 @@ impl Socket {
             segment_size: transmit.segment_size,
             src_ip: transmit.src_ip,
         };
-        self.state.send(UdpSockRef::from(self.io.get_ref()), &transmit)
+        let sent = self
+            .io
+            .try_io(Interest::WRITABLE, || self.state.send(UdpSockRef::from(&self.io), &transmit));
+        // Any other error is a lost packet.
+        !sent.is_err_and(|error| error.kind() == io::ErrorKind::WouldBlock)
     }
-}
-
-/// Whether a socket takes no packets now. Any other error is a lost packet.
-fn is_full(sent: &io::Result<()>) -> bool {
-    sent.as_ref().is_err_and(|error| error.kind() == io::ErrorKind::WouldBlock)
 }
 
 fn would_block(error: io::Error) -> io::Error {
@@ -220,80 +187,4 @@ fn would_block(error: io::Error) -> io::Error {
         tracing::debug!(%error, "the UDP socket reports an error");
     }
     io::ErrorKind::WouldBlock.into()
-}
-
-#[cfg(test)]
-mod tests {
-    use std::{fs, future::poll_fn, os::fd::AsRawFd, time::Duration};
-
-    use tokio::time::timeout;
-
-    use super::*;
-
-    const TIMEOUT: Duration = Duration::from_secs(10);
-
-    fn bind() -> Sockets {
-        let socket = UdpSocket::bind(("127.0.0.1", 0)).unwrap();
-        socket.set_nonblocking(true).unwrap();
-        let address = socket.local_addr().unwrap();
-        Sockets {
-            all: vec![Socket::new(address, socket).unwrap()],
-            port: address.port(),
-            buffer: vec![0; MESSAGES * MESSAGE],
-            mtu: 1452,
-            held: None,
-        }
-    }
-
-    /// Returns the events for which epoll watches a descriptor of this process.
-    fn watched_events(fd: &impl AsRawFd) -> Vec<u32> {
-        let fd = fd.as_raw_fd().to_string();
-        let of_line = |line: &str| {
-            let mut words = line.strip_prefix("tfd:")?.split_whitespace();
-            let is_this = words.next()? == fd;
-            let events = words.nth(1).filter(|_| is_this)?;
-            Some(u32::from_str_radix(events, 16).unwrap())
-        };
-        let mut all = Vec::new();
-        for info in fs::read_dir("/proc/self/fdinfo").unwrap() {
-            // A descriptor may be closed meanwhile.
-            let text = info.and_then(|info| fs::read_to_string(info.path())).unwrap_or_default();
-            all.extend(text.lines().filter_map(of_line));
-        }
-        all
-    }
-
-    #[tokio::test]
-    async fn room_in_the_send_buffer_wakes_nobody_unless_packets_wait_for_it() {
-        const IN: u32 = 1;
-        const OUT: u32 = 4;
-        let mut sockets = bind();
-        let peer = UdpSocket::bind(("127.0.0.1", 0)).unwrap();
-        peer.set_read_timeout(Some(TIMEOUT)).unwrap();
-        let transmit = |size| Transmit {
-            destination: peer.local_addr().unwrap(),
-            ecn: None,
-            size,
-            segment_size: None,
-            src_ip: None,
-        };
-        let events = watched_events(sockets.all[0].io.get_ref());
-        assert!(events.iter().all(|events| events & (IN | OUT) == IN), "{events:x?}");
-        assert_eq!(events.len(), 1);
-
-        sockets.send(0, transmit(3), b"one");
-        assert!(sockets.held.is_none());
-        sockets.hold(0, transmit(3), b"two and more");
-        let room = sockets.held.as_ref().map(|held| &held.room).unwrap();
-        let events = watched_events(room.get_ref());
-        assert!(events.iter().all(|events| events & (IN | OUT) == OUT), "{events:x?}");
-        assert_eq!(events.len(), 1);
-        timeout(TIMEOUT, poll_fn(|cx| sockets.poll_ready(cx))).await.unwrap();
-        assert!(sockets.flush());
-        for expected in [b"one", b"two"] {
-            let mut bytes = [0; 8];
-            let length = peer.recv(&mut bytes).unwrap();
-            assert_eq!(&bytes[..length], expected);
-        }
-    }
 }
