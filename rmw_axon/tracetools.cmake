@@ -1,6 +1,6 @@
 # The tracepoints of ros2_tracing. They are optional: without tracetools, or with one that was built without
-# tracepoints (TRACETOOLS_DISABLED), rmw_axon is built without them. What its header declares differs between
-# the distributions, so the header is asked, by compiling against it.
+# tracepoints (TRACETOOLS_DISABLED), rmw_axon is built without them. Its header differs between the
+# distributions, so tests compile against it.
 
 include(CheckCXXSourceCompiles)
 
@@ -22,7 +22,7 @@ function(axon_add_tracepoints target)
   set(CMAKE_TRY_COMPILE_TARGET_TYPE STATIC_LIBRARY)
   set(CMAKE_REQUIRED_LIBRARIES tracetools::tracetools)
   set(CMAKE_REQUIRED_QUIET ON)
-  # What another tracetools answered does not count.
+  # Results of another tracetools do not count.
   if(NOT "${AXON_TRACETOOLS_ASKED}" STREQUAL "${tracetools_DIR} ${tracetools_VERSION}")
     foreach(variable AXON_TRACE AXON_TRACE_TIMESTAMP AXON_TRACE_SERVICES)
       unset(${variable} CACHE)

@@ -5,7 +5,7 @@
 #include <chrono>
 #include <cstring>
 
-// What the distribution's tracetools has, as tracetools.cmake found: it is there and records, rmw_publish has a
+// The tracepoints of the distribution's tracetools, as tracetools.cmake found: it is there and records, rmw_publish has a
 // timestamp, there are tracepoints of clients and services.
 #ifndef AXON_TRACE
 #define AXON_TRACE 0

@@ -29,7 +29,7 @@ void send_request(const Client & client, const void * request, int64_t sequence)
 int64_t send_response(
   const Service & service, const void * response, const axon_gid_t & client, int64_t sequence);
 
-// Records a take when it ends, however that is: declared before the first step that can fail. `taken` outlives
+// Records a take when it ends, with or without an error: declared before the first step that can fail. `taken` outlives
 // it. The event has the source timestamp of what was taken, or 0. It says that a message was taken only after
 // `delivered`, so a message that cannot be read is an event with a timestamp and without a message.
 template<typename Endpoint>

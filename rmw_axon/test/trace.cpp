@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// The tracepoints that the library reaches, and what they are told. The functions of tracetools here stand in
-// front of those of its library, so no tracer is needed.
+// The tracepoints that the library reaches, and their arguments. The functions of tracetools here stand in front of those
+// of its library, so no tracer is needed.
 
 #include <gtest/gtest.h>
 

@@ -91,6 +91,15 @@ impl PassedFd {
         Self { fd: self.fd.clone(), origin: self.origin_of_copy() }
     }
 
+    /// Closes the descriptor at once if it is a copy of `other`, whose open file stays. A process that receives many
+    /// copies together would otherwise hold all of them until another thread closes them.
+    pub(crate) fn close_copy_of(mut self, other: &Self) {
+        let file = |fd: &Self| fstat(fd).ok().map(|found| (found.st_dev, found.st_ino));
+        if file(&self).is_some_and(|own| Some(own) == file(other)) {
+            self.origin = FdOrigin::Own;
+        }
+    }
+
     fn origin_of_copy(&self) -> FdOrigin {
         match self.origin {
             // The connection must not end with a copy of its descriptor.

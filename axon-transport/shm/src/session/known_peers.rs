@@ -30,7 +30,9 @@ impl KnownPeers {
     pub fn replace(&self, id: &SessionId, descriptors: &mut PeerDescriptors) {
         let known = self.lock().get(id).map(|(doorbell, pidfd)| (doorbell.share(), pidfd.share()));
         if let Some((doorbell, pidfd)) = known {
-            (descriptors.doorbell, descriptors.pidfd) = (doorbell, pidfd);
+            let received = std::mem::replace(&mut descriptors.doorbell, doorbell);
+            received.close_copy_of(&descriptors.doorbell);
+            descriptors.pidfd = pidfd;
         }
     }
 

@@ -24,8 +24,8 @@ pub(super) fn time(timestamp: i64) -> Option<i64> {
 }
 
 /// Creates a publisher in a node. When the call returns, the publisher is matched with the subscriptions in
-/// the graph, unless that takes longer than 50 ms or many endpoints are created in a row: then a session waits
-/// for a tenth of the time.
+/// the graph, unless that takes longer than 50 ms, or new endpoints of the session waited for 100 ms lately: from
+/// then on they wait for a tenth of the time.
 ///
 /// AXON_RET_INVALID_ARGUMENT: a name, the hash or a policy is out of bounds. AXON_RET_BAD_ALLOC: shared
 /// memory is short. AXON_RET_DENIED: the session's permissions do not allow the endpoint.

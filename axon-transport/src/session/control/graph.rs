@@ -196,7 +196,9 @@ impl GraphFollower {
             if source.is_some() {
                 // Own endpoints that are not announced yet are compared once more when they are announced.
                 let shown = self.building.as_ref().unwrap_or(&state.graph.indexed);
-                let shown = shown.counterparts(endpoint).chain(self.arrivals.entries());
+                let arrivals = self.arrivals.entries();
+                let arrivals = arrivals.filter(|one| one.endpoint.topic == endpoint.topic);
+                let shown = shown.counterparts(endpoint).chain(arrivals);
                 found.extend(
                     shown.filter(|one| !ended(&one.endpoint)).map(|one| one.endpoint.clone()),
                 );
@@ -222,7 +224,7 @@ impl GraphFollower {
         }
     }
 
-    /// Returns the session's publishers or subscriptions on the topic of `other` with whose kind it communicates.
+    /// Returns the session's publishers or subscriptions on the topic of `other`, of the kind that communicates with it.
     fn counterparts(&self, other: &Endpoint) -> Vec<EventSource> {
         let state = self.shared.state();
         state.endpoints.topics.counterparts(other).filter_map(|own| source(&state, own)).collect()

@@ -186,6 +186,8 @@ impl Peers {
             let session = PeerSession::map_among(id, descriptors, self.sessions())?;
             let news = self.news.clone();
             session.on_wanted(move || news.want(id));
+            // The dead session's pidfd, which may be the same descriptor, leaves the set of watched ones first.
+            self.peers.remove(&id);
             self.peers.insert(id, Entry::new(session, &self.deaths)?);
         }
         let entry = self.peers.get_mut(&id).ok_or(PeerError::Missing)?;

@@ -47,7 +47,7 @@ impl IndexedView {
         Arc::make_mut(&mut self.view).version = version;
     }
 
-    /// Returns the endpoints on the topic of `endpoint` with whose kind it communicates.
+    /// Returns the endpoints on the topic of `endpoint`, of the kind that communicates with it.
     pub(in crate::session) fn counterparts(
         &self,
         endpoint: &Endpoint,

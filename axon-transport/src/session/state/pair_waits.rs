@@ -1,6 +1,6 @@
-//! Limits how long new endpoints wait for their pairs. For one endpoint, the wait is convenient; a thousand endpoints that
+//! Limits how long new endpoints wait for their pairs. For one endpoint, the wait is convenient. A thousand endpoints that
 //! are created one after the other would keep their program waiting for seconds on a busy host, and for a minute where
-//! other hosts are involved, while they could be matched together.
+//! other hosts are involved. They can be matched together.
 //!
 //! Plain data.
 
@@ -34,10 +34,13 @@ impl PairWaits {
 
     /// Records that an endpoint has waited for this time; `far` if for an endpoint of another host.
     pub(super) fn waited(&mut self, time: Duration, far: bool, now: Instant) {
-        self.owed = Some((self.owed_at(now) + time, now));
         if far && time > LOCAL_PAIR_TIME {
+            // A slow host must not use up the time for pairs on this one.
             self.not_before = Some(now + PAUSE_FACTOR * time);
+            return;
         }
+        // Threads that wait at the same time wait once for the program.
+        self.owed = Some(((self.owed_at(now) + time).min(2 * ALLOWANCE), now));
     }
 
     fn owed_at(&self, now: Instant) -> Duration {
@@ -90,7 +93,22 @@ mod tests {
     }
 
     #[test]
-    fn the_allowance_comes_back() {
+    fn waits_of_many_threads_at_the_same_time_count_as_few() {
+        let (mut waits, now) = (PairWaits::default(), Instant::now());
+        (0..100).for_each(|_| waits.waited(Duration::from_millis(50), false, now));
+        assert!(!waits.are_due(now));
+        assert!(waits.are_due(now + PAUSE_FACTOR * (ALLOWANCE + LOCAL_PAIR_TIME)));
+    }
+
+    #[test]
+    fn wait_for_another_host_leaves_the_time_for_pairs_on_this_one() {
+        let (mut waits, now) = (PairWaits::default(), Instant::now());
+        (0..10).for_each(|_| waits.waited(Duration::from_millis(50), true, now));
+        assert!(waits.are_due(now) && !waits.are_due_far(now));
+    }
+
+    #[test]
+    fn allowance_is_restored_and_not_saved_up() {
         let (mut waits, now) = (PairWaits::default(), Instant::now());
         waits.waited(ALLOWANCE, false, now);
         assert!(!waits.are_due(now));

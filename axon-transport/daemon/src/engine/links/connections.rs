@@ -332,7 +332,7 @@ impl Connections {
                 return Some(transmit);
             }
             if let Some(connection) = self.all.get_mut(&number) {
-                connection.burst.handle_pass();
+                connection.burst.handle_pass(since);
                 connection.is_transmitting = false;
             }
         }

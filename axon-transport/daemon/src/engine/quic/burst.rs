@@ -5,17 +5,24 @@
 //! work at the same time. Each piece costs a system call on either side, which a stream does not need: its peer has
 //! datagrams to decrypt all the time.
 
-/// Datagrams in each of the first pieces of a burst. With half as many the system calls cost what the peer gains.
+use std::time::Duration;
+
+/// Datagrams in each of the first pieces of a burst. With half as many, the system calls cost as much as the peer gains.
 const PIECE: usize = 16;
+/// Time without more than an acknowledgement after which a burst is over although samples wait: the peer does not read
+/// their streams.
+const PAUSE: Duration = Duration::from_millis(5);
 /// A later piece holds at most this part of the datagrams before it in the burst: a quarter.
 const PART: usize = 4;
 
-/// The datagrams that one connection sent since it last had nothing to send.
+/// The datagrams that one connection sent since its last pause.
 #[derive(Debug, Default)]
 pub(in crate::engine) struct Burst {
     sent: usize,
-    /// Those of the current pass.
+    /// Datagrams of the current pass.
     of_pass: usize,
+    /// The time of the last pass that sent more than an acknowledgement.
+    sent_at: Duration,
     /// True if samples wait for QUIC to take more.
     is_full: bool,
 }
@@ -37,10 +44,12 @@ impl Burst {
         self.is_full = is_full;
     }
 
-    /// Handles the end of a pass: QUIC has nothing more to send now. The burst is over if no sample waits and the pass
-    /// sent no more than an acknowledgement.
-    pub(in crate::engine) fn handle_pass(&mut self) {
-        if std::mem::take(&mut self.of_pass) <= 1 && !self.is_full {
+    /// Handles the end of a pass: QUIC sends nothing more now. The burst is over if the pass sent no more than an
+    /// acknowledgement, and no sample waits or the last such pass is some time ago.
+    pub(in crate::engine) fn handle_pass(&mut self, now: Duration) {
+        if std::mem::take(&mut self.of_pass) > 1 {
+            self.sent_at = now;
+        } else if !self.is_full || now >= self.sent_at + PAUSE {
             self.sent = 0;
         }
     }
@@ -54,7 +63,11 @@ mod tests {
     const BATCH: usize = 44;
 
     /// Sends so many datagrams in one pass. Returns the pieces.
-    fn pass(burst: &mut Burst, mut datagrams: usize) -> Vec<usize> {
+    fn pass(burst: &mut Burst, datagrams: usize) -> Vec<usize> {
+        pass_at(burst, datagrams, Duration::ZERO)
+    }
+
+    fn pass_at(burst: &mut Burst, mut datagrams: usize, now: Duration) -> Vec<usize> {
         let mut pieces = Vec::new();
         while datagrams > 0 {
             let piece = datagrams.min(burst.most()).min(BATCH);
@@ -62,7 +75,7 @@ mod tests {
             pieces.push(piece);
             datagrams -= piece;
         }
-        burst.handle_pass();
+        burst.handle_pass(now);
         pieces
     }
 
@@ -97,5 +110,17 @@ mod tests {
         burst.set_full(false);
         pass(&mut burst, 0);
         assert_eq!(pass(&mut burst, 50), [16, 16, 16, 2]);
+    }
+
+    #[test]
+    fn lone_samples_leave_in_pieces_beside_a_stream_that_the_peer_does_not_read() {
+        let mut burst = Burst::default();
+        burst.set_full(true);
+        for number in 0..20 {
+            let now = Duration::from_millis(10 * number);
+            assert_eq!(pass_at(&mut burst, 47, now), [16, 16, 15]);
+            pass_at(&mut burst, 1, now + Duration::from_millis(1));
+            pass_at(&mut burst, 0, now + PAUSE);
+        }
     }
 }
