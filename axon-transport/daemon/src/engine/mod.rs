@@ -156,7 +156,7 @@ impl Engine {
                 self.links.dial(target, now);
             }
             ToGateway::Addresses { daemon, addresses } => {
-                self.links.set_addresses(daemon, &addresses);
+                self.links.set_addresses(now, daemon, &addresses);
             }
             ToGateway::SendDatagram { to, bytes } => self.links.send_datagram(to, bytes),
             ToGateway::Rules(rules, number) => {

@@ -49,7 +49,7 @@ pub(super) fn report(peers: &mut LinkedPeers, links: &Links, effects: &mut Effec
             && let Some(mut status) = links.view(peer.link).and_then(|link| link.status())
         {
             peer.fill(&mut status, now);
-            status.standby = links.standby_status(peer.daemon);
+            status.standby = links.standby_status(peer.daemon, now);
             effects.tell(ToControl::Link(Box::new(status), peer.refused_routes()));
         }
     }

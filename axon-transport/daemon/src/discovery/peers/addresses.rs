@@ -21,21 +21,39 @@ impl PeerDiscovery {
     pub(super) fn report_addresses(&mut self, now: Duration, daemon: DaemonId) {
         let Some(record) = self.records.get(&daemon) else { return };
         let wanted = self.local.has_two_paths && record.linked && record.compatible;
-        let passed = |time| record.reported_addresses.at.is_none_or(|at| at + time <= now);
-        let (early, repeats) = (!passed(REPORT_SPACING), passed(REPEAT));
-        if !wanted || early {
+        if !wanted {
             return;
         }
         let addresses = self.all_addresses(record);
         let Some(record) = self.records.get_mut(&daemon) else { return };
+        let reported = &mut record.reported_addresses;
         // Beacons of two interfaces in turn change the order alone.
-        let known = &record.reported_addresses.addresses;
+        let known = &reported.addresses;
         let changed =
             known.len() != addresses.len() || !addresses.iter().all(|a| known.contains(a));
-        if repeats || changed {
-            record.reported_addresses =
-                ReportedAddresses { addresses: addresses.clone(), at: Some(now) };
+        let passed = |time| reported.at.is_none_or(|at| at + time <= now);
+        if !changed && !passed(REPEAT) {
+            reported.due = None;
+        } else if !passed(REPORT_SPACING) {
+            reported.due = reported.at.map(|at| at + REPORT_SPACING);
+        } else {
+            *reported =
+                ReportedAddresses { addresses: addresses.clone(), at: Some(now), due: None };
             self.act(DiscoveryAction::Addresses { daemon, addresses });
+        }
+    }
+
+    /// Reports the addresses that changed too soon after a report.
+    pub(super) fn report_due_addresses(&mut self, now: Duration) {
+        let due = self
+            .records
+            .iter()
+            .filter(|(_, record)| record.reported_addresses.due.is_some_and(|due| due <= now));
+        for daemon in due.map(|(daemon, _)| *daemon).collect::<Vec<_>>() {
+            if let Some(record) = self.records.get_mut(&daemon) {
+                record.reported_addresses.due = None;
+            }
+            self.report_addresses(now, daemon);
         }
     }
 
@@ -96,8 +114,12 @@ mod tests {
         assert!(reports(&mut peers).is_empty());
         hear_from(&mut peers, 35.0, FIRST);
         assert_eq!(reports(&mut peers), [[FIRST]], "the report may have been lost");
-        hear_from(&mut peers, 37.0, SECOND);
-        assert_eq!(reports(&mut peers), [[FIRST, SECOND]]);
+        hear_from(&mut peers, 35.2, SECOND);
+        assert!(reports(&mut peers).is_empty(), "too soon");
+        let due = secs(36.0);
+        assert!(peers.poll_timeout().is_some_and(|timeout| timeout <= due));
+        peers.handle_timeout(due);
+        assert_eq!(reports(&mut peers).len(), 1);
         peers.handle_link_down(secs(38.0), HIGHER);
         peers.handle_link_up(secs(38.5), HIGHER, from(SECOND), true);
         assert_eq!(reports(&mut peers).len(), 1, "the gateway forgot them");

@@ -150,7 +150,8 @@ impl PeerDiscovery {
                 [dial.due.filter(|_| may_dial), dial.in_flight]
             });
             let expiry = record.may_be_forgotten().then(|| record.gone_at(lifetime));
-            dials.chain([expiry]).flatten().min()
+            let report = record.reported_addresses.due;
+            dials.chain([expiry, report]).flatten().min()
         });
         of_records.chain(self.next_beacon).min()
     }
@@ -160,6 +161,7 @@ impl PeerDiscovery {
         self.give_up_lost_dials(now);
         self.forget_silent(now);
         self.forget_unanswered(now);
+        self.report_due_addresses(now);
         self.dial_due(now);
         if self.next_beacon.is_some_and(|at| at <= now) {
             let first = self.burst_left > 0;

@@ -96,6 +96,8 @@ pub(super) struct UnprovenAddresses(Vec<SocketAddr>);
 pub(super) struct ReportedAddresses {
     pub(super) addresses: Vec<SocketAddr>,
     pub(super) at: Option<Duration>,
+    /// The time of the next report, if the addresses changed too soon after the last one.
+    pub(super) due: Option<Duration>,
 }
 
 /// The dial schedule of one standing.

@@ -22,7 +22,9 @@ impl Links {
     /// Handles that a successor took over from a link. Returns the message for the peer if the link is silent.
     pub(super) fn hand_over(&mut self, old: u64, now: Duration) -> Option<LinkClosed> {
         let ours = self.hello.daemon;
-        let stats = self.connections.get(old)?.quic.stats();
+        let connection = self.connections.get_mut(old)?;
+        connection.watch = None;
+        let stats = connection.quic.stats();
         let link = self.table.get_mut(old)?;
         let peer = link.peer.as_mut()?;
         let silent = peer.silence.handle_superseded(Traffic::from(&stats));

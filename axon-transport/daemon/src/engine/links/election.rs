@@ -110,7 +110,7 @@ impl Links {
         let successor = replaced || current.is_some_and(|peer| peer.silence.is_gone());
         let candidate = Candidate { side, successor };
         let we_elect = ours < daemon;
-        let stands_by = self.may_stand_by(&hello, beside, now);
+        let stands_by = self.may_stand_by(number, &hello, beside, now);
         let loses = |current: &LinkPeer| !new_wins(ours, daemon, current.candidate, candidate);
         // A connection that was to stand by beside an earlier link does not become the link in use.
         if we_elect && !stands_by && (beside.is_some() || current.is_some_and(loses)) {
@@ -195,7 +195,7 @@ impl Links {
 
     /// Ends a link of an address that has more of them than the newcomer's. Returns whether it did.
     fn make_place(&mut self, newcomer: IpAddr, now: Duration) -> bool {
-        let links = self.table.peers();
+        let links = self.table.beside_standby();
         let links: Vec<_> = links
             .filter_map(|(number, _)| Some((self.connections.address(number)?.ip(), number)))
             .collect();
@@ -350,10 +350,6 @@ impl Links {
         let Some(peer) = self.table.peer_mut(number) else { return };
         match peer.age.handle_timeout(now) {
             Some(AgeStep::End) => {
-                let daemon = peer.summary.hello.daemon;
-                if self.replace_by_standby(daemon, now) {
-                    return;
-                }
                 let text = "AXON_QKD_SESSION_MAX_AGE is reached and no successor came";
                 self.close_connection(number, CloseCode::KeySupply, text, now);
                 return self.end_link(number, text, None, now);

@@ -95,12 +95,13 @@ impl LinkTable {
 
     /// Returns the number of links of one identity that do not stand by.
     pub(super) fn of_identity(&self, who: &PeerIdentity) -> usize {
-        self.beside_standby().filter(|peer| peer.summary.who.is(who)).count()
+        self.beside_standby().filter(|(_, peer)| peer.summary.who.is(who)).count()
     }
 
-    fn beside_standby(&self) -> impl Iterator<Item = &LinkPeer> {
-        let links = self.links.values().filter(|link| !matches!(link.phase, LinkPhase::Standby));
-        links.filter_map(|link| link.peer.as_ref())
+    /// Returns the links that do not stand by, with their peers.
+    pub(super) fn beside_standby(&self) -> impl Iterator<Item = (u64, &LinkPeer)> {
+        let links = self.iter().filter(|(_, link)| !matches!(link.phase, LinkPhase::Standby));
+        links.filter_map(|(number, link)| Some((number, link.peer.as_ref()?)))
     }
 
     /// Returns the links that carry samples.

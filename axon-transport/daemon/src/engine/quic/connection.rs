@@ -78,7 +78,7 @@ pub(crate) struct Connection {
     pub(in crate::engine) deadline: Option<std::time::Instant>,
     /// The number of datagrams that arrived with an ECN mark.
     pub(in crate::engine) ecn_marks: u64,
-    /// Since when the peer has not answered, while a second link stands by.
+    /// Since when the peer has not answered, if it is in use and both hosts have two paths.
     pub(in crate::engine) watch: Option<AnswerWatch>,
 }
 

@@ -100,7 +100,8 @@ impl Failover {
         }
         let is_first = sent_at.is_some_and(|sent_at| now < sent_at + FIRST_CHECKS);
         self.next_check = Some(now + if is_first { FIRST_INTERVAL } else { LATER_INTERVAL });
-        None
+        // The packet that asked may be lost, and QUIC repeats it ever more seldom.
+        Some(FailoverStep::Ask)
     }
 }
 

@@ -114,7 +114,7 @@ impl Links {
         let earlier = self.table.standby(daemon);
         let elected_before = earlier.and_then(|earlier| self.table.peer(earlier)?.elected);
         let is_older = elected_before.is_some_and(|before| before.election > elected.election);
-        if !is_beside || is_older {
+        if !is_beside || is_older || self.has_path_in_use(number, daemon) {
             // The link in use changed meanwhile, or messages on two connections overtook each other.
             self.end_standby(number, "the link beside it changed", now);
             return self.opening_failed(number);
@@ -134,7 +134,7 @@ impl Links {
             self.end_standby(earlier, "another link stands by", now);
         }
         if let Some(paths) = self.paths.all.get_mut(&daemon) {
-            paths.search.handle_found(address);
+            paths.search.handle_found(now, address);
             paths.failover.handle_standby();
         }
         tracing::info!(peer = %daemon, %address, "a second link stands by");
@@ -145,7 +145,7 @@ impl Links {
     pub(super) fn handle_in_use(&mut self, daemon: DaemonId, number: u64, now: Duration) {
         let Some(peer) = self.table.peer(number) else { return };
         if !self.has_two_paths(&peer.summary.hello) {
-            return;
+            return self.forget_paths(daemon, now);
         }
         let elects = self.hello.daemon < daemon;
         let exchange = self.exchange(number);
@@ -154,14 +154,13 @@ impl Links {
             failover: Failover::default(),
         });
         paths.failover = Failover::new(exchange);
+        paths.search.forget_answers();
         if let Some(connection) = self.connections.get_mut(number) {
             connection.watch.get_or_insert_default().restart(exchange);
         }
         // The new link may have the path of the one that stands by.
-        let address = |number| self.connections.address(number);
         if let Some(standby) = self.table.standby(daemon)
-            && let (Some(one), Some(other)) = (address(standby), address(number))
-            && !is_other(one, other)
+            && self.has_path_in_use(standby, daemon)
         {
             self.handle_standby_ended(standby, daemon, now);
             self.end_standby(standby, "the link in use has its path", now);
@@ -217,14 +216,23 @@ impl Links {
         if elected.standby == Some(true) {
             return self.stand_by(number, elected, now);
         }
-        // [`open`](Self::open) refuses a link under another host's id.
-        if let Some(peer) = self.table.peer(number)
-            && let daemon = peer.summary.hello.daemon
-            && self.table.standby(daemon) == Some(number)
-            && let (who, proven) = (peer.summary.who.clone(), peer.proven)
-            && self.claim(daemon, &who, proven, now).is_ok()
-        {
+        let Some(link) = self.table.get(number) else { return };
+        let Some(peer) = &link.peer else { return };
+        let (daemon, before) = (peer.summary.hello.daemon, peer.elected);
+        let (who, proven) = (peer.summary.who.clone(), peer.proven);
+        let stands_by = self.table.standby(daemon) == Some(number);
+        let is_another = before.is_some_and(|before| before.link != elected.link);
+        if is_another || (link.beside.is_some() && !stands_by) {
+            let why = "ELECTED puts a link in use that does not stand by";
+            return self.violation(number, CloseCode::OutOfOrder, why, now);
+        }
+        // [`open`](Self::open) refuses a link under another host's id, and a link that is older than the one in use.
+        let current = self.table.current_peer(daemon).and_then(|current| current.elected);
+        let is_newest = current.is_none_or(|current| current.election < elected.election);
+        if stands_by && is_newest && self.claim(daemon, &who, proven, now).is_ok() {
             self.give_up_silent(daemon);
+        }
+        if stands_by {
             self.table.take_standby(daemon);
             if let Some(paths) = self.paths.all.get_mut(&daemon) {
                 paths.search.handle_lost(now);
@@ -242,13 +250,6 @@ impl Links {
         let elected = self.next_elected(Some(before.link), None);
         self.send(number, &LinkMessage::Elected(elected), now);
         self.handle_elected(number, elected, now);
-    }
-
-    /// Puts the link that stands by in use if this side elects, because the link in use ends. Returns whether it did.
-    pub(super) fn replace_by_standby(&mut self, daemon: DaemonId, now: Duration) -> bool {
-        let standby = self.table.standby(daemon).filter(|_| self.hello.daemon < daemon);
-        standby.into_iter().for_each(|standby| self.put_standby_in_use(standby, now));
-        standby.is_some()
     }
 
     /// Takes the link in use for silent: nothing is expected over it when another one takes over.
@@ -284,16 +285,20 @@ impl Links {
     /// Returns when [`look_at_paths`](Self::look_at_paths) is due.
     pub(super) fn paths_timeout(&self) -> Option<Duration> {
         let all = self.paths.all.iter().filter(|_| !self.closing);
-        let due = all.filter_map(|(daemon, paths)| {
-            if self.table.standby(*daemon).is_none() {
-                let waits = self.dials.is_dialling(*daemon);
-                return paths.search.poll_timeout().filter(|_| !waits);
-            }
-            let connection = self.connections.get(self.table.current(*daemon)?)?;
-            let since = connection.watch.as_ref().and_then(AnswerWatch::since);
-            paths.failover.poll_timeout(since, connection.quic.rtt())
+        let due = all.flat_map(|(daemon, paths)| {
+            let waits = self.dials.is_dialling(*daemon);
+            let search = paths.search.poll_timeout().filter(|_| !waits);
+            let search = search.map(|due| due.max(self.standby_silent_at(*daemon)));
+            [search, self.failover_timeout(*daemon, paths)].into_iter().flatten()
         });
         due.min()
+    }
+
+    fn failover_timeout(&self, daemon: DaemonId, paths: &Paths) -> Option<Duration> {
+        self.table.standby(daemon)?;
+        let connection = self.connections.get(self.table.current(daemon)?)?;
+        let since = connection.watch.as_ref().and_then(AnswerWatch::since);
+        paths.failover.poll_timeout(since, connection.quic.rtt())
     }
 
     /// Does the work of the paths that is due.
@@ -303,9 +308,11 @@ impl Links {
         }
         for daemon in self.paths.all.keys().copied().collect::<Vec<_>>() {
             let Some(number) = self.table.current(daemon) else { continue };
-            match self.table.standby(daemon) {
-                Some(standby) => self.compare_paths(daemon, number, standby, now),
-                None => self.probe_paths(daemon, number, now),
+            if let Some(standby) = self.table.standby(daemon) {
+                self.compare_paths(daemon, number, standby, now);
+            }
+            if self.standby_silent_at(daemon) <= now {
+                self.probe_paths(daemon, number, now);
             }
         }
     }
@@ -334,7 +341,9 @@ impl Links {
             Some(FailoverStep::Switch) => {
                 tracing::info!(peer = %daemon,
                     "the path does not answer and the second one does: the second link takes over");
-                if !self.replace_by_standby(daemon, now) {
+                if self.hello.daemon < daemon {
+                    self.put_standby_in_use(standby, now);
+                } else {
                     self.send(standby, &LinkMessage::SwitchOver, now);
                 }
             }
@@ -363,25 +372,30 @@ impl Links {
         !self.paths.all.is_empty()
     }
 
-    /// Handles an answer to a probe, which may be one of another path. It came to the address `local` of this host.
+    /// Handles an answer to a probe, which came to the address `local` of this host. Returns whether it was one of
+    /// another path.
     pub(super) fn handle_path_echo(
         &mut self,
         now: Duration,
         (from, local): (SocketAddr, Option<IpAddr>),
         daemon: DaemonId,
         nonce: Nonce,
-    ) {
-        let Some(number) = self.table.current(daemon) else { return };
-        let in_use = self.connections.get(number).and_then(Connection::local);
-        let Some(paths) = self.paths.all.get_mut(&daemon) else { return };
-        let is_apart = is_apart(in_use, local);
-        let address = paths.search.handle_echo(now, from, nonce, is_apart);
-        if let Some(address) = address
-            && self.table.standby(daemon).is_none()
-            && !self.dials.is_dialling(daemon)
+    ) -> bool {
+        let awaits = |paths: &Paths| paths.search.awaits(nonce);
+        if !self.paths.all.get(&daemon).is_some_and(awaits) {
+            return false;
+        }
+        let has_standby = self.standby_silent_at(daemon) > now;
+        let later = self.dials.is_dialling(daemon);
+        let in_use = self.table.current(daemon).and_then(|number| self.connections.get(number));
+        let is_apart = is_apart(in_use.and_then(Connection::local), local);
+        if let Some(paths) = self.paths.all.get_mut(&daemon)
+            && !has_standby
+            && let Some(address) = paths.search.handle_echo(now, from, nonce, is_apart, later)
         {
             self.dial_standby(daemon, address, now);
         }
+        true
     }
 
     /// Dials a link that is to stand by.
@@ -401,15 +415,26 @@ impl Links {
     }
 
     /// Sets the addresses at which discovery knows a linked peer, best first.
-    pub(in crate::engine) fn set_addresses(&mut self, daemon: DaemonId, addresses: &[SocketAddr]) {
+    pub(in crate::engine) fn set_addresses(
+        &mut self,
+        now: Duration,
+        daemon: DaemonId,
+        addresses: &[SocketAddr],
+    ) {
         if let Some(paths) = self.paths.all.get_mut(&daemon) {
-            paths.search.set_addresses(addresses);
+            paths.search.set_addresses(now, addresses);
         }
     }
 
-    /// Returns the status of the link that stands by for a peer.
-    pub(in crate::engine) fn standby_status(&self, daemon: DaemonId) -> Option<StandbyStatus> {
-        let connection = self.connections.get(self.table.standby(daemon)?)?;
+    /// Returns the status of the link that stands by for a peer, unless it is silent.
+    pub(in crate::engine) fn standby_status(
+        &self,
+        daemon: DaemonId,
+        now: Duration,
+    ) -> Option<StandbyStatus> {
+        let standby =
+            self.table.standby(daemon).filter(|_| self.standby_silent_at(daemon) > now)?;
+        let connection = self.connections.get(standby)?;
         let mut status = StandbyStatus::default();
         status.address = connection.quic.remote_address().to_string();
         status.rtt = connection.quic.rtt();

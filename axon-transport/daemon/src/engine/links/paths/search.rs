@@ -20,8 +20,10 @@ const MAX_PROBE_DOUBLINGS: u32 = 10;
 /// Pause after the first dial. It doubles with each dial that brings no second path.
 const FIRST_DIAL_PAUSE: Duration = Duration::from_secs(2);
 const MAX_DIAL_DOUBLINGS: u32 = 6;
-/// Additional time before the first round of the side that does not elect: the other side's search is enough.
+/// Time for which the side that does not elect leaves the first round, and a dial, to the other side.
 const SECOND_SIDE: Duration = Duration::from_secs(1);
+/// Time after which a second link counts as a success of its dial.
+const SUCCESS: Duration = Duration::from_secs(1);
 
 /// The search for a second path to one peer. A state machine as `docs/architecture.md` describes them.
 ///
@@ -33,16 +35,20 @@ pub(in crate::engine::links) struct PathSearch {
     addresses: Vec<PathAddress>,
     /// The address at which a second link stood by last.
     found: Option<SocketAddr>,
-    /// The time before the first round of this side.
-    head_start: Duration,
+    /// Time that this side leaves to the other one.
+    wait: Duration,
     /// The time since which there is no second path.
     since: Duration,
     /// The time of the next round of probes.
     next: Duration,
-    /// Number of dials since the last one that brought a second path.
+    /// The time before which no dial begins.
+    dial_after: Duration,
+    /// Number of dials since the last success.
     dials: u32,
-    /// The address that answered, over the local address that the link in use has.
-    second_choice: Option<SocketAddr>,
+    /// The time since which a second link stands by.
+    found_at: Option<Duration>,
+    /// An address that answered and is dialled in a round from this time on, unless a better one answers before.
+    choice: Option<(SocketAddr, Duration)>,
 }
 
 #[derive(Debug)]
@@ -76,21 +82,31 @@ pub(in crate::engine::links) struct SearchRound {
 impl PathSearch {
     /// Creates a search without addresses. `elects`: this side elects links.
     pub(in crate::engine::links) fn new(elects: bool, now: Duration) -> Self {
-        let head_start = if elects { Duration::ZERO } else { SECOND_SIDE };
+        let wait = if elects { Duration::ZERO } else { SECOND_SIDE };
         Self {
             addresses: Vec::new(),
             found: None,
-            head_start,
+            wait,
             since: now,
-            next: now + head_start,
+            next: now + wait,
+            dial_after: now,
             dials: 0,
-            second_choice: None,
+            found_at: None,
+            choice: None,
         }
     }
 
     /// Replaces the addresses, best first. What is known of an address stays, and so does the address at which a second
-    /// link stood by last.
-    pub(in crate::engine::links) fn set_addresses(&mut self, addresses: &[SocketAddr]) {
+    /// link stood by last. A new address is probed soon.
+    pub(in crate::engine::links) fn set_addresses(
+        &mut self,
+        now: Duration,
+        addresses: &[SocketAddr],
+    ) {
+        let is_known = |address: &SocketAddr| self.addresses.iter().any(|a| a.address == *address);
+        if !addresses.iter().all(is_known) {
+            self.next = self.next.min((now + self.wait).max(self.dial_after));
+        }
         let mut known = std::mem::take(&mut self.addresses);
         let all = self.found.iter().chain(addresses.iter().filter(|a| Some(**a) != self.found));
         self.addresses = all
@@ -117,8 +133,14 @@ impl PathSearch {
         if self.poll_timeout().is_none_or(|due| now < due) {
             return SearchRound::default();
         }
-        if let Some(address) = self.second_choice.take() {
-            return SearchRound { dial: Some(self.dial(now, address)), ..SearchRound::default() };
+        if let Some((address, from)) = self.choice
+            && from <= now
+        {
+            self.choice = None;
+            if is_other(address, in_use) {
+                let dial = Some(self.dial(now, address));
+                return SearchRound { dial, ..SearchRound::default() };
+            }
         }
         let without = now.saturating_sub(self.since);
         let interval = INTERVALS.iter().find(|(until, _)| without < *until);
@@ -139,13 +161,14 @@ impl PathSearch {
 
     /// Handles the answer of the peer's daemon to a probe. Returns the address if it is to be dialled now. An answer
     /// that `is_apart` came to another local address than that of the link in use, so that the paths share no interface
-    /// of this host; another answer has to wait for such a one until the next round.
+    /// of this host; another answer has to wait for such a one until the next round. With `later`, no dial begins now.
     pub(in crate::engine::links) fn handle_echo(
         &mut self,
         now: Duration,
         from: SocketAddr,
         nonce: Nonce,
         is_apart: bool,
+        later: bool,
     ) -> Option<SocketAddr> {
         let awaited = |address: &&mut PathAddress| address.nonce == Some(nonce);
         let address = self.addresses.iter_mut().find(awaited)?;
@@ -154,36 +177,53 @@ impl PathSearch {
         }
         (address.nonce, address.answered, address.next) = (None, true, Duration::ZERO);
         let answered = address.address;
-        if !is_apart {
-            self.second_choice.get_or_insert(answered);
-            return None;
+        if is_apart && !later && self.wait.is_zero() && self.dial_after <= now {
+            return Some(self.dial(now, answered));
         }
-        Some(self.dial(now, answered))
+        if is_apart || self.choice.is_none() {
+            let from = self.choice.map_or(now + self.wait, |(_, from)| from);
+            self.choice = Some((answered, from.max(self.dial_after)));
+        }
+        None
     }
 
-    /// Begins a dial: the next round follows its pause, and answers that are still awaited do not count.
+    /// Returns whether this probe is awaited.
+    pub(in crate::engine::links) fn awaits(&self, nonce: Nonce) -> bool {
+        self.addresses.iter().any(|address| address.nonce == Some(nonce))
+    }
+
+    /// Begins a dial: the next round follows its pause.
     fn dial(&mut self, now: Duration, address: SocketAddr) -> SocketAddr {
-        self.next = now + FIRST_DIAL_PAUSE * 2u32.pow(self.dials.min(MAX_DIAL_DOUBLINGS));
+        self.dial_after = now + FIRST_DIAL_PAUSE * 2u32.pow(self.dials.min(MAX_DIAL_DOUBLINGS));
+        self.next = self.dial_after;
         self.dials += 1;
-        self.second_choice = None;
-        self.addresses.iter_mut().for_each(|address| address.nonce = None);
+        self.forget_answers();
         address
     }
 
+    /// Forgets the answers and the probes that are awaited: they do not count beside another link in use.
+    pub(in crate::engine::links) fn forget_answers(&mut self) {
+        self.choice = None;
+        self.addresses.iter_mut().for_each(|address| address.nonce = None);
+    }
+
     /// Records that a second link stands by at this address.
-    pub(in crate::engine::links) fn handle_found(&mut self, address: SocketAddr) {
-        (self.dials, self.second_choice) = (0, None);
+    pub(in crate::engine::links) fn handle_found(&mut self, now: Duration, address: SocketAddr) {
+        self.found_at = Some(now);
+        self.forget_answers();
         let known = self.addresses.iter().find(|a| is_same(a.address, address));
         self.found = known.map(|known| known.address).or(self.found);
     }
 
     /// Records that there is no second path any more, or that another path is in use.
     pub(in crate::engine::links) fn handle_lost(&mut self, now: Duration) {
-        let pause = FIRST_DIAL_PAUSE * 2u32.pow(self.dials.min(MAX_DIAL_DOUBLINGS));
-        let soon = now + INTERVALS[0].1 + self.head_start;
-        // Dials that bring a second path for a moment only are no way around their pause.
-        self.next = if self.dials == 0 { soon } else { soon.max(self.next.min(now + pause)) };
+        self.forget_answers();
+        // A dial that brings a second link for a moment only counts as one that brings none.
+        if self.found_at.take().is_some_and(|found_at| found_at + SUCCESS <= now) {
+            (self.dials, self.dial_after) = (0, now);
+        }
         self.since = now;
+        self.next = (now + INTERVALS[0].1 + self.wait).max(self.dial_after);
     }
 }
 
@@ -209,7 +249,7 @@ mod tests {
     fn search(addresses: &[u8]) -> PathSearch {
         let mut search = PathSearch::new(true, NOW);
         let addresses: Vec<_> = addresses.iter().map(|last| address(*last)).collect();
-        search.set_addresses(&addresses);
+        search.set_addresses(NOW, &addresses);
         search
     }
 
@@ -230,11 +270,23 @@ mod tests {
         let mut search = search(&[1, 2, 3]);
         assert_eq!(search.poll_timeout(), Some(NOW));
         assert_eq!(round(&mut search, NOW, 1), [2, 3]);
-        assert_eq!(search.handle_echo(NOW, address(3), [1; 8], true), None, "another's nonce");
-        assert_eq!(search.handle_echo(NOW, address(3), [9; 8], true), None, "no nonce");
-        assert_eq!(search.handle_echo(NOW, address(3), [2; 8], true), Some(address(3)));
-        assert_eq!(search.handle_echo(NOW, address(3), [2; 8], true), None, "it comes twice");
-        assert_eq!(search.handle_echo(NOW, address(2), [1; 8], true), None, "one dial at a time");
+        assert_eq!(
+            search.handle_echo(NOW, address(3), [1; 8], true, false),
+            None,
+            "another's nonce"
+        );
+        assert_eq!(search.handle_echo(NOW, address(3), [9; 8], true, false), None, "no nonce");
+        assert_eq!(search.handle_echo(NOW, address(3), [2; 8], true, false), Some(address(3)));
+        assert_eq!(
+            search.handle_echo(NOW, address(3), [2; 8], true, false),
+            None,
+            "it comes twice"
+        );
+        assert_eq!(
+            search.handle_echo(NOW, address(2), [1; 8], true, false),
+            None,
+            "one dial at a time"
+        );
         assert_eq!(search.poll_timeout(), Some(NOW + FIRST_DIAL_PAUSE));
     }
 
@@ -242,11 +294,11 @@ mod tests {
     fn path_over_the_same_local_address_waits_a_round_for_one_over_another() {
         let mut search = search(&[1, 2, 3]);
         round(&mut search, NOW, 1);
-        assert_eq!(search.handle_echo(NOW, address(2), [1; 8], false), None);
-        assert_eq!(search.handle_echo(NOW, address(3), [2; 8], true), Some(address(3)));
+        assert_eq!(search.handle_echo(NOW, address(2), [1; 8], false, false), None);
+        assert_eq!(search.handle_echo(NOW, address(3), [2; 8], true, false), Some(address(3)));
         let due = search.poll_timeout().unwrap();
         round(&mut search, due, 1);
-        assert_eq!(search.handle_echo(due, address(2), [1; 8], false), None);
+        assert_eq!(search.handle_echo(due, address(2), [1; 8], false, false), None);
         let due = search.poll_timeout().unwrap();
         let round = search.handle_timeout(due, address(1), || unreachable!());
         assert_eq!(round.dial, Some(address(2)), "there is no other");
@@ -256,8 +308,8 @@ mod tests {
     fn address_that_answered_is_probed_in_each_round_and_a_silent_one_ever_less() {
         let mut search = search(&[1, 2, 3]);
         round(&mut search, NOW, 1);
-        search.handle_echo(NOW, address(2), [1; 8], true).unwrap();
-        search.handle_found(address(2));
+        search.handle_echo(NOW, address(2), [1; 8], true, false).unwrap();
+        search.handle_found(NOW, address(2));
         search.handle_lost(NOW + Duration::from_secs(60));
         let mut rounds = [0; 2];
         let mut now = search.poll_timeout().unwrap();
@@ -279,10 +331,10 @@ mod tests {
         for number in 0.. {
             // Each round has another address, which answers at once.
             let other = SocketAddr::from(([10, 0, 9, 9], 1000 + number));
-            search.set_addresses(&[address(1), other]);
+            search.set_addresses(now, &[address(1), other]);
             let round = search.handle_timeout(now, address(1), || [7; 8]);
             for (to, nonce) in round.probes {
-                dials += u32::from(search.handle_echo(now, to, nonce, true).is_some());
+                dials += u32::from(search.handle_echo(now, to, nonce, true, false).is_some());
             }
             now = search.poll_timeout().unwrap();
             if now > NOW + Duration::from_secs(1000) {
@@ -290,31 +342,75 @@ mod tests {
             }
         }
         assert!((8..=14).contains(&dials), "{dials}");
-        search.handle_found(address(2));
-        search.handle_lost(now);
-        assert_eq!(search.poll_timeout(), Some(now + INTERVALS[0].1), "a dial succeeded");
+        search.handle_found(now, address(2));
+        search.handle_lost(now + SUCCESS / 2);
+        assert!(search.poll_timeout() > Some(now + FIRST_DIAL_PAUSE), "it stood for a moment");
+        search.handle_found(now, address(2));
+        search.handle_lost(now + SUCCESS);
+        assert_eq!(search.poll_timeout(), Some(now + SUCCESS + INTERVALS[0].1), "a success");
     }
 
     #[test]
     fn address_of_the_last_second_path_stays_whatever_beacons_say() {
         let mut search = search(&[1, 2]);
         round(&mut search, NOW, 1);
-        search.handle_echo(NOW, address(2), [1; 8], true).unwrap();
-        search.handle_found(address(2));
+        search.handle_echo(NOW, address(2), [1; 8], true, false).unwrap();
+        search.handle_found(NOW, address(2));
         let forged: Vec<_> = (10..100).map(address).collect();
-        search.set_addresses(&forged);
+        search.set_addresses(NOW, &forged);
         assert_eq!(search.addresses.len(), MAX_ADDRESSES);
         let due = search.poll_timeout().unwrap();
         assert_eq!(round(&mut search, due, 1)[..2], [2, 10]);
-        search.set_addresses(&[]);
+        search.set_addresses(NOW, &[]);
         assert_eq!(search.addresses.len(), 1);
+    }
+
+    #[test]
+    fn new_address_is_probed_soon_and_an_answer_beside_another_dial_is_kept() {
+        let mut search = search(&[1, 2]);
+        let late = NOW + Duration::from_secs(100);
+        round(&mut search, late, 1);
+        assert_eq!(search.poll_timeout(), Some(late + LAST_INTERVAL));
+        search.set_addresses(late, &[address(1), address(3)]);
+        assert_eq!(search.poll_timeout(), Some(late));
+        assert_eq!(round(&mut search, late, 1), [3]);
+        assert_eq!(search.handle_echo(late, address(3), [1; 8], true, true), None);
+        let due = search.poll_timeout().unwrap();
+        let round = search.handle_timeout(due, address(1), || unreachable!());
+        assert_eq!(round.dial, Some(address(3)));
+    }
+
+    #[test]
+    fn answer_at_the_address_that_came_into_use_is_not_dialled() {
+        let mut search = search(&[1, 2]);
+        round(&mut search, NOW, 1);
+        assert_eq!(search.handle_echo(NOW, address(2), [1; 8], false, false), None);
+        let due = search.poll_timeout().unwrap();
+        assert_eq!(search.handle_timeout(due, address(2), || [9; 8]).dial, None);
+    }
+
+    #[test]
+    fn side_that_does_not_elect_leaves_the_dial_to_the_other_for_a_second() {
+        let mut search = PathSearch::new(false, NOW);
+        search.set_addresses(NOW, &[address(2)]);
+        let begin = search.poll_timeout().unwrap();
+        round(&mut search, begin, 1);
+        assert_eq!(search.handle_echo(begin, address(2), [1; 8], true, false), None);
+        let mut now = begin;
+        let dialled = loop {
+            now = search.poll_timeout().unwrap();
+            if let Some(dialled) = search.handle_timeout(now, address(1), || [9; 8]).dial {
+                break dialled;
+            }
+        };
+        assert_eq!((dialled, now - begin), (address(2), SECOND_SIDE));
     }
 
     #[test]
     fn side_that_does_not_elect_waits_and_so_it_does_after_each_loss() {
         let mut search = PathSearch::new(false, NOW);
         assert_eq!(search.poll_timeout(), None);
-        search.set_addresses(&[address(2)]);
+        search.set_addresses(NOW, &[address(2)]);
         assert_eq!(search.poll_timeout(), Some(NOW + SECOND_SIDE));
         assert!(round(&mut search, NOW, 1).is_empty());
         search.handle_lost(NOW * 2);

@@ -42,8 +42,10 @@ impl Links {
             true => Datagram::decode(&bytes).ok(),
             false => None,
         };
-        if let Some(Datagram::Echo { nonce, daemon }) = echo {
-            self.handle_path_echo(now, (from, local), daemon, nonce);
+        if let Some(Datagram::Echo { nonce, daemon }) = echo
+            && self.handle_path_echo(now, (from, local), daemon, nonce)
+        {
+            return;
         }
         if let Some(Datagram::Echo { nonce, daemon }) = echo
             && let Some(number) = self.nonces.get(&nonce).copied()
