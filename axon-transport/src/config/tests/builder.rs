@@ -49,6 +49,7 @@ fn all_of_qkd() -> ConfigBuilder {
         .link_qlog("/var/qlog")
         .link_congestion(Congestion::Cubic)
         .link_compression(LinkCompression::Never)
+        .link_paths(2)
 }
 
 fn all_of_classic() -> ConfigBuilder {

@@ -140,6 +140,7 @@ fn nothing_given_is_the_table_of_defaults() {
             qlog: None,
             congestion: Congestion::Auto,
             compression: LinkCompression::Auto,
+            paths: 1,
         }
     );
     assert!(config.warnings().iter().any(|w| w.contains("not authenticated")));
@@ -267,6 +268,7 @@ fn the_environment_wins_over_the_file() {
         qlog = '/var/qlog'
         congestion = 'bbr'
         compression = 'never'
+        paths = 2
     ";
     let config = with_file(&[], file).unwrap();
     assert_eq!(qkd(&config).peers.to_string(), "sae-b;sae-c");
@@ -286,6 +288,7 @@ fn the_environment_wins_over_the_file() {
             qlog: Some("/var/qlog".into()),
             congestion: Congestion::Bbr,
             compression: LinkCompression::Never,
+            paths: 2,
         }
     );
 

@@ -83,11 +83,6 @@ impl LinkTable {
         self.links.iter_mut().map(|(number, link)| (*number, link))
     }
 
-    /// Returns the links whose peers proved their names, with the peers.
-    pub(super) fn peers(&self) -> impl Iterator<Item = (u64, &LinkPeer)> {
-        self.iter().filter_map(|(number, link)| Some((number, link.peer.as_ref()?)))
-    }
-
     /// Returns the number of links that do not stand by.
     pub(super) fn in_use_count(&self) -> usize {
         self.beside_standby().count()

@@ -74,14 +74,33 @@ impl Links {
     /// Returns whether this side elects a connection to stand by.
     pub(super) fn may_stand_by(
         &self,
+        number: u64,
         hello: &LinkHello,
         beside: Option<[u8; 16]>,
         now: Duration,
     ) -> bool {
-        let standby = self.table.standby(hello.daemon).and_then(|number| self.table.peer(number));
-        let is_needed = standby.is_none_or(|peer| peer.silence.heard_at() + STANDBY_SILENT <= now);
-        let has_room = standby.is_some() || self.table.standby_count() < MAX_STANDBY;
-        is_needed && has_room && self.is_beside(hello, beside)
+        let daemon = hello.daemon;
+        let has_room =
+            self.table.standby(daemon).is_some() || self.table.standby_count() < MAX_STANDBY;
+        let is_needed = self.standby_silent_at(daemon) <= now;
+        let is_beside = self.is_beside(hello, beside);
+        is_needed && has_room && is_beside && !self.has_path_in_use(number, daemon)
+    }
+
+    /// Returns the time from which on there is no second path to a peer: its second link was silent for a while, or
+    /// there is none.
+    fn standby_silent_at(&self, daemon: DaemonId) -> Duration {
+        let standby = self.table.standby(daemon).and_then(|number| self.table.peer(number));
+        standby.map_or(Duration::ZERO, |peer| peer.silence.heard_at() + STANDBY_SILENT)
+    }
+
+    /// Returns whether a link has the path of the peer's link in use: the same address there, and the same here.
+    fn has_path_in_use(&self, number: u64, daemon: DaemonId) -> bool {
+        let connection = |number| self.connections.get(number);
+        let Some(in_use) = self.table.current(daemon).and_then(connection) else { return false };
+        let Some(other) = connection(number) else { return false };
+        let [one, two] = [in_use, other].map(|connection| connection.quic.remote_address());
+        !is_other(one, two) && !is_apart(in_use.local(), other.local())
     }
 
     /// Elects a connection to stand by.

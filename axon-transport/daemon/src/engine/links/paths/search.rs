@@ -396,11 +396,10 @@ mod tests {
         let begin = search.poll_timeout().unwrap();
         round(&mut search, begin, 1);
         assert_eq!(search.handle_echo(begin, address(2), [1; 8], true, false), None);
-        let mut now = begin;
-        let dialled = loop {
-            now = search.poll_timeout().unwrap();
+        let (dialled, now) = loop {
+            let now = search.poll_timeout().unwrap();
             if let Some(dialled) = search.handle_timeout(now, address(1), || [9; 8]).dial {
-                break dialled;
+                break (dialled, now);
             }
         };
         assert_eq!((dialled, now - begin), (address(2), SECOND_SIDE));
