@@ -13,10 +13,15 @@ def test_the_command_line_shows_nodes_topics_and_services(host):
         'both nodes are listed')
     assert '/chatter [std_msgs/msg/String]' in host.run('ros2', 'topic', 'list', '-t', '--no-daemon')
     info = host.run('ros2', 'topic', 'info', '-v', '/chatter', '--no-daemon')
-    for part in (
-            'Type: std_msgs/msg/String', 'Publisher count: 1', 'Subscription count: 1',
-            'Node name: talker', 'Node name: listener', 'Topic type hash: RIHS01_',
-            'Reliability: RELIABLE', 'Durability: VOLATILE', 'Liveliness: AUTOMATIC'):
+    parts = [
+        'Type: std_msgs/msg/String', 'Publisher count: 1', 'Subscription count: 1',
+        'Node name: talker', 'Node name: listener',
+        'Reliability: RELIABLE', 'Durability: VOLATILE', 'Liveliness: AUTOMATIC']
+    from rclpy.topic_endpoint_info import TopicEndpointInfo
+    # Humble has no type hashes.
+    if hasattr(TopicEndpointInfo, 'topic_type_hash'):
+        parts.append('Topic type hash: RIHS01_')
+    for part in parts:
         assert part in info, info
     node = host.run('ros2', 'node', 'info', '/talker', '--no-daemon')
     assert '/chatter: std_msgs/msg/String' in node

@@ -3,9 +3,9 @@
 
 import array
 
+import events
 from program import main, say, spin
 import rclpy
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
@@ -48,13 +48,11 @@ def listener():
     node = rclpy.create_node('listener')
 
     def hear(kind, topic, profile, tell):
-        def on_matched(event):
-            if event.current_count > 0:
+        def on_matched(count):
+            if count > 0:
                 say(f'matched {topic}')
 
-        node.create_subscription(
-            kind, topic, tell, profile,
-            event_callbacks=SubscriptionEventCallbacks(matched=on_matched))
+        events.subscription(node, kind, topic, tell, profile, on_matched)
 
     def view(image):
         number, data = int(image.header.frame_id), image.data

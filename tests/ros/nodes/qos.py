@@ -4,10 +4,10 @@
 import threading
 import time
 
+import events
 from program import main, say, spin
 import rclpy
 from rclpy.duration import Duration
-from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
@@ -43,12 +43,12 @@ def profile(options):
 def publisher(count, period, *options):
     """Publishes `count` messages, one every `period` seconds, and stays."""
     node = rclpy.create_node('qos_publisher')
-    events = PublisherEventCallbacks(
+    out = events.publisher(
+        node, String, 'qos', profile(options),
         deadline=lambda e: say(f'offered deadline missed {e.total_count}'),
         liveliness=lambda e: say(f'liveliness lost {e.total_count}'),
         incompatible_qos=lambda e: say(f'offered incompatible {e.last_policy_kind}'),
-        matched=lambda e: say(f'matched {e.current_count}'))
-    out = node.create_publisher(String, 'qos', profile(options), event_callbacks=events)
+        matched=lambda count: say(f'matched {count}'))
     sent = 0
 
     def publish():
@@ -67,19 +67,17 @@ def subscription(delay, *options):
     node = rclpy.create_node('qos_subscription')
     matched = threading.Event()
 
-    def on_matched(event):
-        say(f'matched {event.current_count}')
-        if event.current_count > 0:
+    def on_matched(count):
+        say(f'matched {count}')
+        if count > 0:
             matched.set()
 
-    events = SubscriptionEventCallbacks(
+    events.subscription(
+        node, String, 'qos', lambda message: say(f'heard {message.data}'), profile(options),
         deadline=lambda e: say(f'requested deadline missed {e.total_count}'),
         liveliness=lambda e: say(f'alive {e.alive_count}, not alive {e.not_alive_count}'),
         incompatible_qos=lambda e: say(f'requested incompatible {e.last_policy_kind}'),
         matched=on_matched)
-    node.create_subscription(
-        String, 'qos', lambda message: say(f'heard {message.data}'), profile(options),
-        event_callbacks=events)
     if float(delay) > 0:
         while not matched.is_set():
             rclpy.spin_once(node, timeout_sec=0.1)

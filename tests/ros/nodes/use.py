@@ -9,7 +9,8 @@ from example_interfaces.action import Fibonacci
 from lifecycle_msgs.msg import Transition, TransitionEvent
 from lifecycle_msgs.srv import ChangeState
 from program import main, say, spin
-from rcl_interfaces.msg import Parameter, ParameterEvent, ParameterType, ParameterValue
+from rcl_interfaces.msg import (
+    Parameter, ParameterEvent, ParameterType, ParameterValue, SetParametersResult)
 from rcl_interfaces.srv import GetParameters, SetParameters
 import rclpy
 from rclpy._rclpy_pybind11 import RCLError
@@ -36,8 +37,9 @@ def robot():
     def changed(parameters):
         for parameter in parameters:
             say(f'{parameter.name} set by {parameter.value}')
+        return SetParametersResult(successful=True)
 
-    arm.add_post_set_parameters_callback(changed)
+    arm.add_on_set_parameters_callback(changed)
     dock = rclpy.create_node('docking')
 
     def execute(goal):
