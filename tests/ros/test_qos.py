@@ -44,6 +44,7 @@ def test_a_publisher_that_is_killed_is_alive_no_more(host):
     subscription = host.node('qos', 'subscription', 0, f'lease={2000 * MILLISECOND}')
     publisher = host.node('qos', 'publisher', 100000, 0.1, f'lease={1000 * MILLISECOND}')
     subscription.said('alive 1, not alive 0')
+    subscription.said('matched 1')
     publisher.kill()
     subscription.said('alive 0, not alive 0')
     subscription.said('matched 0')

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT OR Apache-2.0
 """A publisher and a subscription of any quality of service, which say what they are told of it."""
 
-import threading
 import time
 
 import events
@@ -63,24 +62,18 @@ def publisher(count, period, *options):
 
 
 def subscription(delay, *options):
-    """Begins to take `delay` seconds after it is matched."""
+    """Begins to take `delay` seconds after it sees a publisher."""
     node = rclpy.create_node('qos_subscription')
-    matched = threading.Event()
-
-    def on_matched(count):
-        say(f'matched {count}')
-        if count > 0:
-            matched.set()
-
     events.subscription(
         node, String, 'qos', lambda message: say(f'heard {message.data}'), profile(options),
         deadline=lambda e: say(f'requested deadline missed {e.total_count}'),
         liveliness=lambda e: say(f'alive {e.alive_count}, not alive {e.not_alive_count}'),
         incompatible_qos=lambda e: say(f'requested incompatible {e.last_policy_kind}'),
-        matched=on_matched)
+        matched=lambda count: say(f'matched {count}'))
     if float(delay) > 0:
-        while not matched.is_set():
-            rclpy.spin_once(node, timeout_sec=0.1)
+        # Without a spin, which might take a message.
+        while node.count_publishers('qos') == 0:
+            time.sleep(0.01)
         time.sleep(float(delay))
         say('taking')
     spin(node)
