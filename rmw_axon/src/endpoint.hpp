@@ -15,6 +15,7 @@
 #include "axon.h"
 #include "cdr/plan.hpp"
 #include "context.hpp"
+#include "features.hpp"
 #include "rmw/event.h"
 #include "rmw/types.h"
 #include "rosidl_runtime_c/message_type_support_struct.h"
@@ -51,7 +52,7 @@ public:
 
 private:
   std::mutex mutex_;
-  std::array<std::unique_ptr<EventSource>, RMW_EVENT_INVALID> sources_;
+  std::array<std::unique_ptr<EventSource>, AXON_RMW_LAST_EVENT + 1> sources_;
 };
 
 struct Publisher

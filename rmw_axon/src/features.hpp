@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// What the ROS distributions differ in, read off their headers: Humble (rmw 6.1), Iron (7.1), Jazzy (7.3)
-// and Rolling (7.5). Only cdr/buffer.hpp asks, too, of rosidl.
+// What the ROS distributions differ in, read off their headers: Humble (rmw 6.1), Iron (7.1), Jazzy (7.3),
+// Kilted (7.8), Lyrical and Rolling (7.10). Only cdr/buffer.hpp asks, too, of rosidl.
 
 #ifndef FEATURES_HPP_
 #define FEATURES_HPP_
@@ -28,6 +28,14 @@
 #define AXON_RMW_DYNAMIC_MESSAGES 1
 #else
 #define AXON_RMW_DYNAMIC_MESSAGES 0
+#endif
+
+// The event type with the highest number. RMW_EVENT_INVALID does not bound them: it follows the last one up to
+// Jazzy, and is 0 from Kilted on.
+#if AXON_RMW_IRON
+#define AXON_RMW_LAST_EVENT RMW_EVENT_PUBLICATION_MATCHED
+#else
+#define AXON_RMW_LAST_EVENT RMW_EVENT_OFFERED_QOS_INCOMPATIBLE
 #endif
 
 // After Kilted: the endpoints of a service, as those of a topic.
