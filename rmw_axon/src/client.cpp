@@ -6,6 +6,7 @@
 #include "cdr/codec.hpp"
 #include "endpoint.hpp"
 #include "error.hpp"
+#include "features.hpp"
 #include "gid.hpp"
 #include "names.hpp"
 #include "qos.hpp"
@@ -138,9 +139,8 @@ rmw_ret_t rmw_service_server_is_available(
 {
   return guarded(
     [&] {
-      // rmw's tests ask for RMW_RET_ERROR where one is null.
       if (node == nullptr || client == nullptr || is_available == nullptr) {
-        throw Failure(RMW_RET_ERROR, "node, client or is_available is null");
+        throw Failure(AXON_RMW_NULL_ARGUMENT, "node, client or is_available is null");
       }
       rmw_axon::node_of(node);
       Client & of = client_of(client);

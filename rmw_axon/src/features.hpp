@@ -38,6 +38,14 @@
 #define AXON_RMW_LAST_EVENT RMW_EVENT_OFFERED_QOS_INCOMPATIBLE
 #endif
 
+// What rmw_destroy_wait_set and rmw_service_server_is_available return for a null argument. The headers of all
+// distributions say RMW_RET_INVALID_ARGUMENT; rmw's tests up to Jazzy want RMW_RET_ERROR.
+#if __has_include("rmw/enclave.h")
+#define AXON_RMW_NULL_ARGUMENT RMW_RET_INVALID_ARGUMENT
+#else
+#define AXON_RMW_NULL_ARGUMENT RMW_RET_ERROR
+#endif
+
 // After Kilted: the endpoints of a service, as those of a topic.
 #if __has_include("rmw/get_service_endpoint_info.h")
 #define AXON_RMW_SERVICE_ENDPOINT_INFO 1

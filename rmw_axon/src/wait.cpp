@@ -8,6 +8,7 @@
 #include "context.hpp"
 #include "endpoint.hpp"
 #include "error.hpp"
+#include "features.hpp"
 #include "qos.hpp"
 #include "rmw/rmw.h"
 
@@ -95,9 +96,8 @@ rmw_ret_t rmw_destroy_wait_set(rmw_wait_set_t * wait_set)
 {
   return guarded(
     [&] {
-      // rmw's tests ask for RMW_RET_ERROR, not INVALID_ARGUMENT.
       if (wait_set == nullptr) {
-        throw Failure(RMW_RET_ERROR, "wait_set is null");
+        throw Failure(AXON_RMW_NULL_ARGUMENT, "wait_set is null");
       }
       rmw_axon::require_object(wait_set, "wait_set");
       delete static_cast<WaitSet *>(wait_set->data);
