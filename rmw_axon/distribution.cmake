@@ -2,7 +2,7 @@
 # rosidl tell: ROS_DISTRO is not set by every installation.
 
 # Distribution, rmw, rosidl
-set(axon_tested_distributions "Jazzy 7.3 4.6")
+set(axon_tested_distributions "Humble 6.1 3.1" "Jazzy 7.3 4.6" "Rolling 7.10 5.3")
 
 function(axon_warn_of_distribution rmw rosidl)
   set(names "")
