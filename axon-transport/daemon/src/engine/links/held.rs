@@ -22,7 +22,8 @@ pub(in crate::engine) struct HeldByLinks {
 
 impl Links {
     pub(in crate::engine) fn held(&self) -> HeldByLinks {
-        let (all, links) = (self.table.iter().count(), self.table.beside_standby().count());
+        let all = self.table.iter().count();
+        let links = self.table.iter().filter(|(_, link)| link.peer.is_some()).count();
         let numbers = self.connections.numbers();
         let connections = numbers.iter().filter_map(|number| self.connections.get(*number));
         let (unsent, unhandled) = connections
