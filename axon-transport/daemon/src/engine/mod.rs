@@ -267,7 +267,7 @@ impl Engine {
                 self.handle_stream(now, number, daemon, opened);
             }
             LinkEvent::Message(number, daemon, message, _room) => {
-                self.handle_message(now, number, daemon, message);
+                self.handle_message(now, number, daemon, *message);
             }
             LinkEvent::Stream(number, daemon, event) => {
                 self.handle_stream(now, number, daemon, event)

@@ -24,7 +24,7 @@ pub(in crate::engine) enum LinkEvent {
         closed: Option<LinkClosed>,
     },
     /// A message on the link in use, with what it weighs on the peer's account until it is handled.
-    Message(u64, DaemonId, LinkMessage, Option<Charge>),
+    Message(u64, DaemonId, Box<LinkMessage>, Option<Charge>),
     /// An event of a data stream of any link of this peer.
     Stream(u64, DaemonId, StreamEvent),
     /// The keys of this link changed.

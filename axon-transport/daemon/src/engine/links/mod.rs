@@ -394,6 +394,7 @@ impl Links {
                 if let LinkMessage::Graph(_) = &message {
                     self.succeeded(daemon);
                 }
+                let message = Box::new(message);
                 self.outbox.event(LinkEvent::Message(number, daemon, message, room));
             }
         }

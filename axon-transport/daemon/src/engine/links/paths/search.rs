@@ -342,9 +342,13 @@ mod tests {
             }
         }
         assert!((8..=14).contains(&dials), "{dials}");
+        search.set_addresses(now, &[address(1), address(2)]);
+        assert_eq!(round(&mut search, now, 1), [2]);
+        assert_eq!(search.handle_echo(now, address(2), [1; 8], true, false), Some(address(2)));
         search.handle_found(now, address(2));
         search.handle_lost(now + SUCCESS / 2);
-        assert!(search.poll_timeout() > Some(now + FIRST_DIAL_PAUSE), "it stood for a moment");
+        let pause = FIRST_DIAL_PAUSE * 2u32.pow(MAX_DIAL_DOUBLINGS);
+        assert_eq!(search.poll_timeout(), Some(now + pause), "it stood for a moment");
         search.handle_found(now, address(2));
         search.handle_lost(now + SUCCESS);
         assert_eq!(search.poll_timeout(), Some(now + SUCCESS + INTERVALS[0].1), "a success");
