@@ -6,7 +6,7 @@ use axon_shm::ids::DaemonId;
 use quinn_proto::{Dir, StreamEvent, VarInt};
 use rand::RngExt;
 
-use super::identity::PeerIdentity;
+use super::identity::{OTHERS, PeerIdentity};
 use super::{
     LinkEvent, LinkReport, Links,
     link::{
@@ -37,8 +37,6 @@ const ELECTION_TIMEOUT: Duration = Duration::from_secs(10);
 const MAX_LINKS: usize = 128 + 32;
 /// Maximum number of links of one proven identity.
 const MAX_LINKS_OF_PEER: usize = 16;
-/// The text for a peer that claims the id of another one.
-pub(super) const OTHERS: &str = "this daemon id is that of another host";
 
 impl Links {
     /// Handles that a connection's peer sent HELLO and proved its name.

@@ -9,6 +9,9 @@ use axon_transport::access::Principal;
 use super::admission::place;
 use crate::link::LinkHello;
 
+/// The text for a peer that claims the id of another one.
+pub(super) const OTHERS: &str = "this daemon id is that of another host";
+
 /// The identity that a peer proved.
 #[derive(Clone, Debug)]
 pub(crate) enum PeerIdentity {

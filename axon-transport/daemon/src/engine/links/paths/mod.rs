@@ -2,10 +2,10 @@
 //! link in use does not answer.
 
 mod failover;
+mod peers;
 mod search;
 
 use std::{
-    collections::HashMap,
     net::{IpAddr, SocketAddr},
     time::Duration,
 };
@@ -14,13 +14,15 @@ use axon_shm::ids::DaemonId;
 use axon_transport::status::StandbyStatus;
 use rand::RngExt;
 
+pub(super) use self::peers::PeerPaths;
 use self::{
     failover::{Failover, FailoverStep},
+    peers::Paths,
     search::{PathSearch, is_other},
 };
 use super::{
     Links,
-    election::OTHERS,
+    identity::OTHERS,
     link::{
         LinkPhase,
         age::{Age, AgeStep},
@@ -44,18 +46,6 @@ use crate::{
 const MAX_STANDBY: usize = 64;
 /// Time since its last packet after which another link may replace one that stands by.
 const STANDBY_SILENT: Duration = Duration::from_secs(15);
-
-/// The paths to the peers that may have two links at a time.
-#[derive(Default)]
-pub(super) struct PeerPaths {
-    all: HashMap<DaemonId, Paths>,
-}
-
-/// The paths to one peer.
-struct Paths {
-    search: PathSearch,
-    failover: Failover,
-}
 
 impl Links {
     /// Returns whether this host and the peer support a second link at a time.

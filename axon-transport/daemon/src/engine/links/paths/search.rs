@@ -324,7 +324,7 @@ mod tests {
     }
 
     #[test]
-    fn dials_that_fail_become_rarer_whatever_addresses_answer() {
+    fn dials_that_fail_become_rarer_though_other_addresses_answer() {
         let mut search = search(&[1, 2]);
         let mut dials = 0;
         let mut now = NOW;
@@ -355,7 +355,7 @@ mod tests {
     }
 
     #[test]
-    fn address_of_the_last_second_path_stays_whatever_beacons_say() {
+    fn address_of_the_last_second_path_outlasts_forged_beacons() {
         let mut search = search(&[1, 2]);
         round(&mut search, NOW, 1);
         search.handle_echo(NOW, address(2), [1; 8], true, false).unwrap();

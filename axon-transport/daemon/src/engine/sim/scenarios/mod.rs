@@ -9,7 +9,6 @@ mod long;
 mod losses;
 mod memory;
 mod moves;
-mod paths;
 mod priorities;
 mod radio;
 mod refused;

@@ -204,7 +204,7 @@ fn a_peer_that_breaks_its_link_again_and_again_holds_no_publisher_up_for_long() 
 
 #[test]
 fn an_outage_costs_a_publisher_nothing_that_it_can_keep() {
-    // Cuts of any length that QUIC survives: `cuts.rs`. Here the history is half full when the path breaks.
+    // Cuts of any length that QUIC survives: `cuts`. Here the history is half full when the path breaks.
     let mut of = Held::new(126);
     assert!(!of.publish(secs(5), |_| {}));
     let cut = of.world.network.partition(&[1], None);

@@ -2,6 +2,8 @@
 
 #![allow(clippy::print_stdout, reason = "a scenario prints its figures")]
 
+mod paths;
+
 use std::time::Duration;
 
 use axon_shm::qos::Qos;
