@@ -90,7 +90,7 @@ pub struct LinkStatus {
     #[serde(default, rename = "waiting_ms", with = "times::millis")]
     pub oldest_waits: Duration,
     /// The second link to the peer, which stands by over another path.
-    #[serde(default)]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub standby: Option<StandbyStatus>,
     /// Samples received.
     pub samples_in: u64,
