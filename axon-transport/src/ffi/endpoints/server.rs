@@ -138,7 +138,7 @@ pub unsafe extern "C" fn axon_session_server_respond(
     len: usize,
 ) -> axon_ret_t {
     // SAFETY: guaranteed by the caller.
-    unsafe { axon_session_server_respond_at(server, client, sequence, AXON_TIME_NOW, data, len) }
+    guarded(|| unsafe { respond(server, client, sequence, AXON_TIME_NOW, data, len) })
 }
 
 /// Answers as `axon_session_server_respond` does, with the caller's `source_timestamp`: nanoseconds since the
@@ -155,19 +155,33 @@ pub unsafe extern "C" fn axon_session_server_respond_at(
     data: *const u8,
     len: usize,
 ) -> axon_ret_t {
-    guarded(|| {
-        let server = named(server)?;
-        // SAFETY: guaranteed by the caller.
-        let client = unsafe { value(client, "the client's GID") }?;
-        // SAFETY: guaranteed by the caller.
-        let payload = unsafe { elements(data, len, "the response") }?;
-        let client = Gid(client.bytes);
-        let sent = match time(source_timestamp) {
-            Some(time) => server.send_response_at(client, sequence, from_unix_nanos(time), payload),
-            None => server.send_response(client, sequence, payload),
-        };
-        sent.map_err(|e| CallFailure::from(e).of_endpoint(server.endpoint()))
-    })
+    // SAFETY: guaranteed by the caller.
+    guarded(|| unsafe { respond(server, client, sequence, source_timestamp, data, len) })
+}
+
+/// Sends a response.
+///
+/// # Safety
+/// As for `axon_session_server_respond`.
+unsafe fn respond(
+    server: axon_server_t,
+    client: *const axon_gid_t,
+    sequence: u64,
+    source_timestamp: i64,
+    data: *const u8,
+    len: usize,
+) -> Result<(), CallFailure> {
+    let server = named(server)?;
+    // SAFETY: guaranteed by the caller.
+    let client = unsafe { value(client, "the client's GID") }?;
+    // SAFETY: guaranteed by the caller.
+    let payload = unsafe { elements(data, len, "the response") }?;
+    let client = Gid(client.bytes);
+    let sent = match time(source_timestamp) {
+        Some(time) => server.send_response_at(client, sequence, from_unix_nanos(time), payload),
+        None => server.send_response(client, sequence, payload),
+    };
+    sent.map_err(|e| CallFailure::from(e).of_endpoint(server.endpoint()))
 }
 
 /// Sets the callback for new requests, as `axon_session_subscription_set_callback` does.
