@@ -159,9 +159,11 @@ impl PathSearch {
         SearchRound { probes: probes.collect(), dial: None }
     }
 
-    /// Handles the answer of the peer's daemon to a probe. Returns the address if it is to be dialled now. An answer
-    /// that `is_apart` came to another local address than that of the link in use, so that the paths share no interface
-    /// of this host; another answer has to wait for such a one until the next round. With `later`, no dial begins now.
+    /// Handles the answer of the peer's daemon to a probe. Returns the address if the caller is to dial it now.
+    ///
+    /// `is_apart`: the answer came to another local address than that of the link in use. The two paths then share no
+    /// interface of this host, and the address goes first. Any other address waits for such an answer until the next
+    /// round. `later`: the caller dials the peer already, so the address waits, too.
     pub(in crate::engine::links) fn handle_echo(
         &mut self,
         now: Duration,

@@ -44,6 +44,17 @@ fn with_paths(
     }
 }
 
+/// Returns settings whose links are renewed after ten seconds.
+fn short_lived(mode: KeyMode) -> impl Fn(usize) -> Config {
+    move |host| {
+        let mut config = qkd(&format!("sae-{host}"), mode);
+        if let Security::Qkd(qkd) = &mut config.security {
+            qkd.session_max_age = secs(20);
+        }
+        config
+    }
+}
+
 impl TwoPaths {
     fn new(seed: u64, config: &Settings) -> Self {
         Self::with(seed, with_paths(config, |_| 2))
@@ -220,14 +231,7 @@ fn one_host_with_one_path_has_no_second_link() {
 #[test]
 fn renewals_of_both_links_lose_nothing_and_leave_a_second_link() {
     for mode in [KeyMode::Session, KeyMode::Messages10] {
-        let config = |host: usize| {
-            let mut config = qkd(&format!("sae-{host}"), mode);
-            if let Security::Qkd(qkd) = &mut config.security {
-                qkd.session_max_age = secs(20);
-            }
-            config
-        };
-        let mut paths = TwoPaths::with(66, with_paths(config, |_| 2));
+        let mut paths = TwoPaths::with(66, with_paths(short_lived(mode), |_| 2));
         for _ in 0..12 {
             paths.publish(secs(10));
         }
@@ -265,14 +269,7 @@ fn daemon_that_is_killed_links_again_over_two_paths() {
 #[test]
 fn renewal_of_a_link_without_data_in_flight_delays_no_sample() {
     for mode in [KeyMode::Session, KeyMode::Messages10] {
-        let config = |host: usize| {
-            let mut config = qkd(&format!("sae-{host}"), mode);
-            if let Security::Qkd(qkd) = &mut config.security {
-                qkd.session_max_age = secs(20);
-            }
-            config
-        };
-        let mut paths = TwoPaths::with(68, config);
+        let mut paths = TwoPaths::with(68, short_lived(mode));
         for _ in 0..4 {
             // The history holds less than two seconds of samples.
             let gap = paths.publish(secs(10));
