@@ -9,7 +9,8 @@ use quinn_proto::ConnectionStats;
 pub(in crate::engine) struct Exchange {
     /// Number of acknowledgements.
     pub(in crate::engine) acknowledged: u64,
-    /// Number of frames with data or limits.
+    /// Number of sent frames with data or limits. Frames that QUIC sends by itself to keep the connection, or to find out
+    /// how long a packet may be, do not count.
     pub(in crate::engine) asked: u64,
     /// Number of PING frames. QUIC sends them to keep the connection, with a probe of a longer packet, and when
     /// acknowledgements are missing.

@@ -17,7 +17,7 @@ const PART: usize = 4;
 
 /// The datagrams that one connection sent since its last pause.
 #[derive(Debug, Default)]
-pub(in crate::engine) struct Burst {
+pub(in crate::engine) struct DatagramBurst {
     sent: usize,
     /// Datagrams of the current pass.
     of_pass: usize,
@@ -27,7 +27,7 @@ pub(in crate::engine) struct Burst {
     is_full: bool,
 }
 
-impl Burst {
+impl DatagramBurst {
     /// Returns the number of datagrams that may leave together.
     pub(in crate::engine) fn most(&self) -> usize {
         PIECE.max(self.sent / PART)
@@ -63,11 +63,11 @@ mod tests {
     const BATCH: usize = 44;
 
     /// Sends so many datagrams in one pass. Returns the pieces.
-    fn pass(burst: &mut Burst, datagrams: usize) -> Vec<usize> {
+    fn pass(burst: &mut DatagramBurst, datagrams: usize) -> Vec<usize> {
         pass_at(burst, datagrams, Duration::ZERO)
     }
 
-    fn pass_at(burst: &mut Burst, mut datagrams: usize, now: Duration) -> Vec<usize> {
+    fn pass_at(burst: &mut DatagramBurst, mut datagrams: usize, now: Duration) -> Vec<usize> {
         let mut pieces = Vec::new();
         while datagrams > 0 {
             let piece = datagrams.min(burst.most()).min(BATCH);
@@ -81,7 +81,7 @@ mod tests {
 
     #[test]
     fn a_sample_of_64_kib_leaves_in_three_pieces_each_time() {
-        let mut burst = Burst::default();
+        let mut burst = DatagramBurst::default();
         for _ in 0..3 {
             assert_eq!(pass(&mut burst, 47), [16, 16, 15]);
             assert_eq!(pass(&mut burst, 1), [1], "an acknowledgement");
@@ -90,7 +90,7 @@ mod tests {
 
     #[test]
     fn pieces_of_a_longer_burst_grow() {
-        let mut burst = Burst::default();
+        let mut burst = DatagramBurst::default();
         let pieces = pass(&mut burst, 400);
         assert_eq!(pieces[..8], [16, 16, 16, 16, 16, 20, 25, 31]);
         assert_eq!(pieces[8..13], [39, 44, 44, 44, 44]);
@@ -100,7 +100,7 @@ mod tests {
 
     #[test]
     fn a_burst_lasts_while_samples_wait_for_quic() {
-        let mut burst = Burst::default();
+        let mut burst = DatagramBurst::default();
         pass(&mut burst, 400);
         burst.set_full(true);
         for _ in 0..3 {
@@ -114,7 +114,7 @@ mod tests {
 
     #[test]
     fn lone_samples_leave_in_pieces_beside_a_stream_that_the_peer_does_not_read() {
-        let mut burst = Burst::default();
+        let mut burst = DatagramBurst::default();
         burst.set_full(true);
         for number in 0..20 {
             let now = Duration::from_millis(10 * number);

@@ -12,7 +12,7 @@ use rustls_pki_types::CertificateDer;
 
 use super::{
     answers::{AnswerWatch, Exchange},
-    burst::Burst,
+    burst::DatagramBurst,
     control_stream::ControlStream,
     link_rate::LinkRate,
 };
@@ -69,7 +69,7 @@ pub(crate) struct Connection {
     /// The rate that the connection carries.
     rate: LinkRate,
     /// The datagrams that leave together.
-    pub(in crate::engine) burst: Burst,
+    pub(in crate::engine) burst: DatagramBurst,
     /// True if it is in the list of connections with something to do.
     pub(in crate::engine) is_dirty: bool,
     /// True if it is in the list of connections that may transmit.
@@ -99,7 +99,7 @@ impl Connection {
             egress: Egress::default(),
             loss: PacketLoss::default(),
             rate: LinkRate::default(),
-            burst: Burst::default(),
+            burst: DatagramBurst::default(),
             is_dirty: false,
             is_transmitting: false,
             deadline: None,
@@ -284,7 +284,7 @@ pub(crate) struct Carrier<'a> {
     /// The rate that the link carries in bytes per second, if the link was full lately or a limit states the rate.
     pub(in crate::engine) rate: Option<f64>,
     measured: &'a mut LinkRate,
-    burst: &'a mut Burst,
+    burst: &'a mut DatagramBurst,
 }
 
 impl Carrier<'_> {

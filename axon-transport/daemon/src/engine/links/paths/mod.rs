@@ -278,16 +278,14 @@ impl Links {
     }
 
     /// Records the answers of the peer of a link, whose connection had work.
-    pub(super) fn note_answers(&mut self, number: u64, daemon: DaemonId) {
-        if self.table.current(daemon) == Some(number)
-            && let Some(paths) = self.paths.all.get_mut(&daemon)
+    pub(super) fn note_answers(&mut self, number: u64, daemon: DaemonId, exchange: Exchange) {
+        if let Some(paths) = self.paths.all.get_mut(&daemon)
+            && self.table.current(daemon) == Some(number)
+            && paths.failover.handle_exchange(exchange)
             && let Some(connection) = self.connections.get_mut(number)
             && let Some(watch) = &mut connection.watch
         {
-            let exchange = Exchange::from(&connection.quic.stats());
-            if paths.failover.handle_exchange(exchange) {
-                watch.restart(exchange);
-            }
+            watch.restart(exchange);
         }
     }
 

@@ -78,7 +78,7 @@ impl Links {
         if peer.silence.handle_heard(now, traffic) {
             self.outbox.event(LinkEvent::Back(daemon));
         }
-        self.note_answers(number, daemon);
+        self.note_answers(number, daemon, traffic.exchange());
     }
 
     /// Probes the path of links over which something was sent and nothing arrived in the last second. Peers from which

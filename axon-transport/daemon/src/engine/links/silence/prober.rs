@@ -10,7 +10,7 @@
 
 use std::time::Duration;
 
-use crate::link::Side;
+use crate::{engine::quic::answers::Exchange, link::Side};
 
 /// Time between two probes.
 const PROBE_EVERY: Duration = Duration::from_millis(250);
@@ -45,40 +45,34 @@ pub(in crate::engine::links) struct Traffic {
     /// Number of received frames. A count of datagrams would include those that any host sends; a packet that is not
     /// authentic, or comes twice, has no frame.
     came: u64,
-    /// Number of acknowledgements among them.
-    acknowledged: u64,
-    /// Number of sent frames that ask for an answer. Frames that QUIC sends by itself to keep the connection, or to
-    /// find out how long a packet may be, do not count.
-    asked: u64,
+    exchange: Exchange,
 }
 
 impl Traffic {
     /// Reads the counters from a connection's statistics.
     pub(crate) fn from(stats: &quinn_proto::ConnectionStats) -> Self {
-        let sent = stats.frame_tx;
-        let asked = sent.stream
-            + sent.datagram
-            + sent.reset_stream
-            + sent.stop_sending
-            + sent.max_data
-            + sent.max_stream_data;
-        Self { came: frames_came(stats), acknowledged: stats.frame_rx.acks, asked }
+        Self { came: frames_came(stats), exchange: Exchange::from(stats) }
     }
 
     #[cfg(test)]
     pub(super) fn of(came: u64, acknowledged: u64, asked: u64) -> Self {
-        Self { came, acknowledged, asked }
+        Self { came, exchange: Exchange { acknowledged, asked, pings: 0 } }
+    }
+
+    /// Returns the frames that asked for an answer, and the answers.
+    pub(crate) fn exchange(self) -> Exchange {
+        self.exchange
     }
 
     /// Returns whether the peer acknowledged something since `before`: QUIC then retransmits missing data at once.
     pub(crate) fn answered_since(self, before: Self) -> bool {
-        self.acknowledged != before.acknowledged
+        self.exchange.is_answered_since(before.exchange)
     }
 
     /// Returns whether nothing arrived since `before`, and something that asks for an answer was sent since the last
     /// datagram came, when the traffic was `heard`.
     pub(crate) fn is_silent(self, before: Self, heard: Self) -> bool {
-        self.came == before.came && self.asked > heard.asked
+        self.came == before.came && self.exchange.asked > heard.exchange.asked
     }
 
     /// Returns whether a datagram came since `before`.
