@@ -82,6 +82,11 @@ impl Config {
             .all(|one| *one != Some(LinkCompression::Never))
     }
 
+    /// Returns whether small RELIABLE samples of a topic, or the calls of a service, may cross both paths to a host.
+    pub fn topic_redundancy(&self, name: &str) -> bool {
+        topics::first(&self.topics, name).is_none_or(|rule| rule.redundant)
+    }
+
     /// Returns the limit that `max_hz` sets for the samples of a topic to each other host.
     pub fn topic_limit(&self, name: &str) -> Option<RateLimit> {
         topics::first(&self.topics, name)?.limit()

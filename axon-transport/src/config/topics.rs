@@ -22,18 +22,28 @@ pub struct TopicRule {
     pub max_hz: Option<f64>,
     /// Compression of samples for other hosts. It applies only if `[link] compression` enables compression.
     pub compression: LinkCompression,
+    /// True if RELIABLE samples of at most 4 KiB also leave over the second path to a host. It applies only if `[link]
+    /// paths` is 2.
+    pub redundant: bool,
 }
 
 impl TopicRule {
     /// Creates a rule that gives this priority to the topics and services whose names fit.
     pub const fn new(name: TopicPattern, priority: TopicPriority) -> Self {
-        Self { name, priority, max_hz: None, compression: LinkCompression::Auto }
+        Self { name, priority, max_hz: None, compression: LinkCompression::Auto, redundant: true }
     }
 
     /// Disables compression of the samples.
     #[must_use]
     pub const fn uncompressed(mut self) -> Self {
         self.compression = LinkCompression::Never;
+        self
+    }
+
+    /// Sends each sample over one path only.
+    #[must_use]
+    pub const fn over_one_path(mut self) -> Self {
+        self.redundant = false;
         self
     }
 
@@ -77,7 +87,7 @@ fn rule(entry: toml::Value, place: &str) -> Result<TopicRule, ConfigError> {
         return Err(ConfigError::name("topic", "entries that begin with [[topic]]").at(place));
     };
     let (mut name, mut priority, mut max_hz) = (None, TopicPriority::Normal, None);
-    let mut compression = LinkCompression::Auto;
+    let (mut compression, mut redundant) = (LinkCompression::Auto, true);
     for (key, value) in entry {
         let read = value.as_str().unwrap_or_else(|| value.type_str());
         match key.as_str() {
@@ -110,15 +120,20 @@ fn rule(entry: toml::Value, place: &str) -> Result<TopicRule, ConfigError> {
                 let wrong = || ConfigError::value("topic.compression", read, accepted()).at(place);
                 compression = known.map(|(_, compression)| *compression).ok_or_else(wrong)?;
             }
+            "redundant" => {
+                let wrong =
+                    || ConfigError::value("topic.redundant", read, "true or false").at(place);
+                redundant = value.as_bool().ok_or_else(wrong)?;
+            }
             _ => {
                 let name = format!("topic.{key}");
-                let known = "name, priority, max_hz, compression";
+                let known = "name, priority, max_hz, compression, redundant";
                 return Err(ConfigError::name(&name, known).at(place));
             }
         }
     }
     let missing = || ConfigError::missing("topic.name", "a topic's name, or a pattern").at(place);
-    Ok(TopicRule { name: name.ok_or_else(missing)?, priority, max_hz, compression })
+    Ok(TopicRule { name: name.ok_or_else(missing)?, priority, max_hz, compression, redundant })
 }
 
 /// Returns the first entry that fits the name of a topic or service.

@@ -9,6 +9,10 @@ use serde::{Deserialize, Serialize};
 
 use super::{LimitStatus, times};
 
+fn is_zero(count: &u64) -> bool {
+    *count == 0
+}
+
 /// A link that stands by over another path, and takes over when the path of the link in use does not answer.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]
@@ -18,6 +22,9 @@ pub struct StandbyStatus {
     /// Round-trip time; microseconds in JSON.
     #[serde(rename = "rtt_us", with = "times::micros")]
     pub rtt: Duration,
+    /// Copies of small samples that left over the link.
+    #[serde(default)]
+    pub copies_out: u64,
 }
 
 /// A link to another host's daemon.
@@ -94,6 +101,9 @@ pub struct LinkStatus {
     pub standby: Option<StandbyStatus>,
     /// Samples received.
     pub samples_in: u64,
+    /// Of the samples received, those that came over the second path first.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub copies_in: u64,
     /// Samples sent.
     pub samples_out: u64,
     /// Bytes received.

@@ -139,6 +139,7 @@ impl AcceptedLink {
 
         let header = StreamHeader {
             reliable: true,
+            copy: false,
             short: false,
             acknowledged: false,
             route: subscribe.route,

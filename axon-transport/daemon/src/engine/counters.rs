@@ -33,6 +33,8 @@ pub(crate) struct TopicLoss {
 pub(crate) struct Counters {
     samples_in: Cell<u64>,
     bytes_in: Cell<u64>,
+    /// Samples that came over the second path first.
+    copies_in: Cell<u64>,
     samples_out: Cell<u64>,
     bytes_out: Cell<u64>,
     compressed: Cell<CompressedStatus>,
@@ -46,6 +48,11 @@ impl Counters {
     pub(crate) fn arrived(&self, bytes: usize) {
         self.samples_in.set(self.samples_in.get() + 1);
         self.bytes_in.set(self.bytes_in.get() + bytes as u64);
+    }
+
+    /// Counts a sample that arrived, and did so over the second path first.
+    pub(crate) fn arrived_first(&self) {
+        self.copies_in.set(self.copies_in.get() + 1);
     }
 
     /// A sample was handed to QUIC.
@@ -98,6 +105,7 @@ impl Counters {
     /// Puts the counters into `status`.
     pub(crate) fn fill(&self, status: &mut axon_transport::status::LinkStatus) {
         status.samples_in = self.samples_in.get();
+        status.copies_in = self.copies_in.get();
         status.bytes_in = self.bytes_in.get();
         status.samples_out = self.samples_out.get();
         status.bytes_out = self.bytes_out.get();

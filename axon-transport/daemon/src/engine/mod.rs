@@ -262,6 +262,9 @@ impl Engine {
                     peer.send_graph(with.local, true);
                 });
                 self.reports.hurry(now);
+                if let Some(peer) = self.peers.get_mut(daemon) {
+                    peer.inbound.handle_elected(number);
+                }
                 // Streams that the peer opened before this host knew it: QUIC told of them once.
                 let opened = StreamEvent::Opened { dir: Dir::Uni };
                 self.handle_stream(now, number, daemon, opened);
@@ -421,11 +424,15 @@ impl Engine {
     fn pump(&mut self, now: Duration) {
         let mut events = Vec::new();
         for (daemon, peer) in self.peers.iter_mut() {
-            if peer.outbound.has_work()
-                && let Some(mut carrier) = self.links.carrier(peer.link, now)
-            {
-                peer.outbound.pump(&mut carrier, now);
-                self.links.touch(peer.link);
+            if peer.outbound.has_work() {
+                let batch = self.links.copy_batch(daemon, now);
+                if let Some(mut carrier) = self.links.carrier(peer.link, now) {
+                    carrier.copies = batch;
+                    peer.outbound.pump(&mut carrier, now);
+                    let copies = carrier.copies.copies;
+                    self.links.touch(peer.link);
+                    self.links.send_copies(daemon, copies, now);
+                }
             }
             while let Some(event) = peer.outbound.poll_event() {
                 events.push((daemon, event));

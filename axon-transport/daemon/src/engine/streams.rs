@@ -36,13 +36,19 @@ impl Engine {
             }
             StreamEvent::Finished { id } => {
                 let Some(connection) = self.links.connection(number) else { return };
+                if connection.copies.handle_over(id) {
+                    return;
+                }
                 let Some(flow) = connection.flows.remove(&id) else { return };
                 if in_use {
                     peer.outbound.handle_finished(now, flow, id, &mut connection.quic);
                 }
             }
-            StreamEvent::Stopped { id, .. } if in_use => {
+            StreamEvent::Stopped { id, .. } => {
                 let Some(connection) = self.links.connection(number) else { return };
+                if connection.copies.handle_stopped(&mut connection.quic, id) || !in_use {
+                    return;
+                }
                 let Some(flow) = connection.flows.remove(&id) else { return };
                 peer.outbound.handle_stopped(flow, id, &mut connection.quic);
             }
@@ -63,11 +69,12 @@ impl Engine {
                 }
                 let Some((number, stream)) = peer.inbound.next_ready() else { break };
                 read = true;
-                let Some((quic, mut open)) = self.links.reader(number) else {
+                let Some((quic, mut open, copies_alone)) = self.links.reader(number) else {
                     peer.inbound.forget_stream((number, stream));
                     continue;
                 };
-                match peer.inbound.read((number, stream), quic, &mut open, now) {
+                let key = (number, stream);
+                match peer.inbound.read(key, quic, &mut open, copies_alone, now) {
                     Ok(bytes) => *left = left.saturating_sub(bytes),
                     Err((code, why)) => violations.push((number, code, why)),
                 }

@@ -105,6 +105,7 @@ impl Inbound {
         }
         if acknowledged {
             self.receipts.came(flow, sequence, length, now);
+            self.handle_delivered(flow);
         }
         self.release(stream);
         if header.reliable { StepOutcome::Go } else { StepOutcome::Over }

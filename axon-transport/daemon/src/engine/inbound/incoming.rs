@@ -7,6 +7,7 @@ use axon_shm::ids::Gid;
 use bytes::{Bytes, BytesMut};
 use quinn_proto::{ReadError, ReadableError, StreamId};
 
+use super::copies::ReadCopy;
 use crate::engine::{
     account::Charge,
     sample::{short_header::ShortHeaders, stream_header::StreamHeader},
@@ -28,6 +29,10 @@ pub(super) enum Piece {
 pub(super) enum StreamStep {
     /// Its header.
     Header,
+    /// The election of its link. Its header was read.
+    Election,
+    /// For a copy, the number of the sample before it.
+    After,
     /// The route, or the turn, of its flow, until this time.
     Turn(Duration),
     /// The length of the next message.
@@ -42,6 +47,8 @@ pub(super) enum StreamStep {
     Writer(OpenedMessage, Duration),
     /// Space in the ring.
     Ring(OpenedMessage),
+    /// The sample before a copy.
+    Copy(ReadCopy),
     /// Its end: no more data is wanted from it.
     Over,
 }
@@ -61,6 +68,8 @@ pub(super) struct OpenedMessage {
 pub(super) struct IncomingStream {
     pub(super) step: StreamStep,
     pub(super) header: Option<(StreamHeader, Option<Route>)>,
+    /// For a copy, the number of the sample before it in its flow; 0 if there is none.
+    pub(super) after: u64,
     /// The last short header, if the messages have short headers.
     pub(super) headers: Option<ShortHeaders>,
     /// The rest of the last chunk from QUIC.
@@ -74,6 +83,8 @@ pub(super) struct IncomingStream {
     /// The time since which its message has waited for memory that other rings have.
     pub(super) short_since: Option<Duration>,
     pub(super) is_ready: bool,
+    /// True if its link carries copies alone, since it stands by.
+    pub(super) copies_alone: bool,
 }
 
 impl Default for IncomingStream {
@@ -81,6 +92,7 @@ impl Default for IncomingStream {
         Self {
             step: StreamStep::Header,
             header: None,
+            after: 0,
             headers: None,
             chunk: Bytes::new(),
             gathered: BytesMut::new(),
@@ -88,6 +100,7 @@ impl Default for IncomingStream {
             unpacked: None,
             short_since: None,
             is_ready: false,
+            copies_alone: false,
         }
     }
 }
@@ -152,6 +165,7 @@ impl IncomingStream {
     pub(super) fn held(&self) -> usize {
         let message = match &self.step {
             StreamStep::Writer(message, _) | StreamStep::Ring(message) => message.payload.len(),
+            StreamStep::Copy(copy) => copy.message.payload.len(),
             StreamStep::Unpack(_, sent) => sent.len(),
             _ => 0,
         };

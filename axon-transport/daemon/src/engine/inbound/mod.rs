@@ -4,6 +4,7 @@
 //! order when a successor takes over. While a ring is full, its stream is not read: QUIC's flow control then
 //! holds back the peer.
 
+mod copies;
 mod delivery;
 #[cfg(test)]
 mod held;
@@ -29,6 +30,7 @@ use axon_transport::internal::log_limit::LogLimit;
 use quinn_proto::{StreamId, VarInt};
 
 use self::{
+    copies::WaitingCopies,
     incoming::{IncomingStream, StreamStep},
     limited::RateLimitedStreams,
     receipts::Receipts,
@@ -118,6 +120,7 @@ pub(crate) struct Inbound {
     /// Streams that wait for memory.
     without_room: StreamQueue,
     limited: RateLimitedStreams,
+    waiting_copies: WaitingCopies,
     /// Memory for one short message if the identity has none left. Complete messages are then read one after
     /// the other.
     spare: Rc<Meter>,
@@ -157,6 +160,7 @@ impl Inbound {
             full: HashSet::new(),
             without_room: StreamQueue::default(),
             limited: RateLimitedStreams::default(),
+            waiting_copies: WaitingCopies::default(),
             spare: Meter::new(LONG_MESSAGE_BYTES),
             full_retry: None,
             exceeded: None,
@@ -187,6 +191,16 @@ impl Inbound {
     pub(crate) fn handle_readable(&mut self, link: u64, stream: StreamId) {
         self.streams.entry((link, stream)).or_default();
         self.make_ready((link, stream));
+    }
+
+    /// Continues the streams of a link that was elected: it may carry more than copies now.
+    pub(crate) fn handle_elected(&mut self, link: u64) {
+        let waits = |stream: &IncomingStream| matches!(stream.step, StreamStep::Election);
+        let streams = self.streams.iter().filter(|(key, stream)| key.0 == link && waits(stream));
+        let mut keys: Vec<_> = streams.map(|(key, _)| *key).collect();
+        // In the order in which the peer opened them.
+        keys.sort_unstable();
+        keys.into_iter().for_each(|key| self.make_ready(key));
     }
 
     fn make_ready(&mut self, key: StreamKey) {
@@ -303,6 +317,7 @@ impl Inbound {
         if let StreamStep::Turn(until) | StreamStep::Writer(_, until) = stream.step {
             self.waiting.remove(&(until, key));
         }
+        self.forget_copy(key, &stream);
     }
 
     /// Returns when [`handle_timeout`](Self::handle_timeout) or [`poll_receipt`](Self::poll_receipt) is due.

@@ -8,6 +8,7 @@ use bytes::Bytes;
 
 use super::{
     ARRIVAL, ENDED, Inbound, LONG_MESSAGE_BYTES, LinkViolation, NO_ROUTE, StreamKey, TURN,
+    copies::{AFTER, permit_copy, permit_length, read_after},
     incoming::{IncomingStream, OpenedMessage, Piece, StreamStep},
 };
 use crate::engine::sample::stream_header::{HEADER, StreamHeader};
@@ -26,7 +27,8 @@ use crate::{
 };
 
 impl Inbound {
-    /// Reads a stream as far as possible. Returns the number of bytes read, including those gained by decompression.
+    /// Reads a stream as far as possible. Returns the number of bytes read, including those gained by decompression. A
+    /// link that stands by carries `copies_alone`.
     ///
     /// # Errors
     /// The peer broke a rule.
@@ -35,8 +37,12 @@ impl Inbound {
         key: StreamKey,
         quic: &mut quinn_proto::Connection,
         open: &mut Open<'_>,
+        copies_alone: bool,
         now: Duration,
     ) -> Result<usize, LinkViolation> {
+        if let Some(stream) = self.streams.get_mut(&key) {
+            stream.copies_alone = copies_alone;
+        }
         let read = self.read_turn(key, quic, open, now);
         if let Some(written) = self.written.take() {
             written.announce();
@@ -104,15 +110,43 @@ impl Inbound {
                 let header = StreamHeader::parse(&header).map_err(malformed)?;
                 stream.header = Some((header, None));
                 stream.headers = header.short.then(ShortHeaders::default);
+                stream.step = StreamStep::Election;
+                Ok(StepOutcome::Go)
+            }
+            StreamStep::Election => {
+                let Some((header, _)) = stream.header else { return Ok(StepOutcome::Over) };
+                if header.copy {
+                    permit_copy(open)?;
+                    stream.step = StreamStep::After;
+                    return Ok(StepOutcome::Go);
+                }
+                if stream.copies_alone {
+                    return Ok(wait(stream, StreamStep::Election));
+                }
                 let turns = self.turns.entry((header.route, header.of)).or_default();
                 turns.push_back(key);
                 self.waiting.insert((now + ARRIVAL, key));
                 stream.step = StreamStep::Turn(now + ARRIVAL);
                 Ok(StepOutcome::Go)
             }
+            StreamStep::After => {
+                let after = match stream.take(AFTER, key.1, quic, read) {
+                    Piece::Whole(after) => after,
+                    Piece::Later => return Ok(wait(stream, StreamStep::After)),
+                    Piece::End => return Ok(StepOutcome::Over),
+                };
+                stream.after = read_after(after);
+                let Some((header, of_route)) = &mut stream.header else {
+                    return Ok(StepOutcome::Over);
+                };
+                *of_route = self.routes.get(&header.route).map(|route| route.route);
+                Ok(if of_route.is_some() { StepOutcome::Go } else { StepOutcome::Over })
+            }
+            StreamStep::Copy(copy) => Ok(self.deliver_copy(key, stream, copy, now)),
             StreamStep::Turn(until) => Ok(self.begin(key, stream, quic, until, now)),
             StreamStep::Length => {
-                if let Some(next) = self.run(key, stream, open, now)? {
+                let copies = stream.header.is_some_and(|(header, _)| header.copy);
+                if !copies && let Some(next) = self.run(key, stream, open, now)? {
                     return Ok(next);
                 }
                 let prefix = match stream.take(4, key.1, quic, read) {
@@ -123,6 +157,9 @@ impl Inbound {
                 let mut bytes = [0; 4];
                 bytes.copy_from_slice(&prefix);
                 let length = u64::from(u32::from_be_bytes(bytes));
+                if copies {
+                    permit_length(length)?;
+                }
                 let limit = self.max_message + MAX_OVERHEAD as u64;
                 if length > limit {
                     let text = format!("a message of {length} bytes, at most {limit} are allowed");
@@ -232,6 +269,15 @@ impl Inbound {
         };
         let numbered = header.acknowledged && route.kind == Kind::Response;
         writer_of(route.kind, header.of, numbered, &opened).map_err(malformed)?;
+        if header.copy {
+            if opened.compressed {
+                return Err(malformed("a copy that is compressed"));
+            }
+            let message = self.message(header, route, &opened, payload, now);
+            self.release(stream);
+            stream.step = Self::copy_step(message, now);
+            return Ok(StepOutcome::Go);
+        }
         if opened.compressed {
             stream.step = StreamStep::Unpack(opened, payload);
             return Ok(StepOutcome::Go);

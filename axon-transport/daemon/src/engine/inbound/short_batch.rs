@@ -74,6 +74,7 @@ impl Inbound {
         let flow = (header.route, header.of);
         if let Some(newest) = came.newest {
             self.receipts.came_all(flow, newest, came.samples, came.bytes, now);
+            self.handle_delivered(flow);
         }
         match next? {
             None => Ok(None),

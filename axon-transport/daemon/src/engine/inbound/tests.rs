@@ -144,6 +144,7 @@ impl Way {
         inbound.routes().insert(ROUTE, into);
         let header = StreamHeader {
             reliable: true,
+            copy: false,
             short,
             acknowledged: false,
             route: ROUTE,

@@ -92,13 +92,17 @@ impl Links {
         Some(connection.carrier(seal, now))
     }
 
-    /// Returns the connection of a link, and the opener of its messages.
+    /// Returns the connection of a link, the opener of its messages, and whether it carries copies alone.
     pub(in crate::engine) fn reader(
         &mut self,
         number: u64,
-    ) -> Option<(&mut quinn_proto::Connection, Open<'_>)> {
+    ) -> Option<(&mut quinn_proto::Connection, Open<'_>, bool)> {
         let connection = self.connections.get_mut(number)?;
-        let link = self.table.get(number).filter(|link| link.carries())?;
+        let link = self.table.get(number)?;
+        let copies_alone = link.carries_copies();
+        if !link.carries() && !copies_alone {
+            return None;
+        }
         let seals = link.peer.as_ref()?.seals;
         let open = match self.keyring.as_mut().filter(|_| seals) {
             Some(keyring) => {
@@ -107,6 +111,6 @@ impl Links {
             }
             None => Open::Link,
         };
-        Some((&mut connection.quic, open))
+        Some((&mut connection.quic, open, copies_alone))
     }
 }

@@ -295,7 +295,8 @@ impl Links {
             StreamEvent::Readable { id } if id.dir() == Dir::Bi => {}
             event => {
                 // Before the election a link carries no samples, whatever identity its peer claims.
-                let link = self.table.get(number).filter(|link| link.carries());
+                let carries = |link: &&Link| link.carries() || link.carries_copies();
+                let link = self.table.get(number).filter(carries);
                 let peer = link.and_then(|link| link.peer.as_ref());
                 if let Some(daemon) = peer.map(|peer| peer.summary.hello.daemon) {
                     self.outbox.event(LinkEvent::Stream(number, daemon, event));

@@ -125,6 +125,7 @@ impl Outbound {
             acknowledged: route.acknowledged,
             short_headers: route.short_headers,
             compressed: route.compressed,
+            redundant: route.redundant,
             limit: route.limit,
             responses: self.responses.clone(),
             credit: Rc::clone(self.turns.credit()),

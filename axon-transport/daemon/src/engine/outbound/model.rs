@@ -161,6 +161,7 @@ pub(super) fn route(number: u32, priority: TopicPriority) -> FlowRoute {
         acknowledged: true,
         short_headers: false,
         compressed: true,
+        redundant: true,
         limit: RouteLimit::default(),
         responses: ResponseNumbers::default(),
         credit: PeerCredit::new(),

@@ -134,6 +134,11 @@ impl Queue {
         if self.policy.is_reliable() { left.min(self.budget.free()) } else { left }
     }
 
+    /// Returns the highest number that was ever sent; 0 if there is none.
+    pub(super) fn newest_sent(&self) -> u64 {
+        self.newest_sent
+    }
+
     /// Returns whether RELIABLE samples were sent and are not acknowledged.
     pub(super) fn has_sent(&self) -> bool {
         !self.sent.is_empty()

@@ -31,6 +31,8 @@ pub(crate) struct RouteOut {
     pub(crate) short_headers: bool,
     /// True if its samples may be compressed.
     pub(crate) compressed: bool,
+    /// True if small samples may cross both paths.
+    pub(crate) redundant: bool,
     /// The limits on the route's samples to the peer.
     pub(crate) limit: RouteLimit,
     /// The sources of its samples.
@@ -50,6 +52,7 @@ pub(super) struct FlowRoute {
     pub(super) acknowledged: bool,
     pub(super) short_headers: bool,
     pub(super) compressed: bool,
+    pub(super) redundant: bool,
     pub(super) limit: RouteLimit,
     pub(super) responses: ResponseNumbers,
     pub(super) credit: Rc<PeerCredit>,

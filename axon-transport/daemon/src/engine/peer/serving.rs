@@ -127,6 +127,7 @@ impl Peer {
             acknowledged,
             short_headers,
             compressed: with.config.topic_compression(&key.topic),
+            redundant: with.config.topic_redundancy(&key.topic),
             limit: RouteLimit::new(self.limits(with.config).outgoing(&key)),
             sources: sources.clone(),
             seen,

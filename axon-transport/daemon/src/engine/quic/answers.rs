@@ -41,6 +41,8 @@ impl Exchange {
 /// The time at which the first packet left that asks for an answer, since the peer's latest one.
 #[derive(Clone, Copy, Debug, Default)]
 pub(in crate::engine) struct AnswerWatch {
+    /// Number of acknowledgements when the latest one came.
+    acknowledged: u64,
     /// Frames that asked for an answer when the latest one came.
     sent: u64,
     since: Option<Duration>,
@@ -49,7 +51,15 @@ pub(in crate::engine) struct AnswerWatch {
 impl AnswerWatch {
     /// Begins anew: the peer answered.
     pub(in crate::engine) fn restart(&mut self, exchange: Exchange) {
-        *self = Self { sent: exchange.asked + exchange.pings, since: None };
+        let Exchange { acknowledged, asked, pings } = exchange;
+        *self = Self { acknowledged, sent: asked + pings, since: None };
+    }
+
+    /// Begins anew if the peer answered since.
+    pub(in crate::engine) fn handle_exchange(&mut self, exchange: Exchange) {
+        if exchange.acknowledged != self.acknowledged {
+            self.restart(exchange);
+        }
     }
 
     /// Records that a packet left.
@@ -89,7 +99,9 @@ mod tests {
         watch.handle_sent(|| exchange(3, 5, 1), NOW * 2);
         watch.handle_sent(|| exchange(3, 9, 1), NOW * 3);
         assert_eq!(watch.since(), Some(NOW * 2), "the first one");
-        watch.restart(exchange(4, 9, 1));
+        watch.handle_exchange(exchange(3, 9, 1));
+        assert_eq!(watch.since(), Some(NOW * 2), "nothing was acknowledged");
+        watch.handle_exchange(exchange(4, 9, 1));
         assert_eq!(watch.since(), None);
     }
 

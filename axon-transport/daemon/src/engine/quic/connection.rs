@@ -6,6 +6,7 @@ use std::{
     time::Duration,
 };
 
+use axon_envelope::{Delivery, Route};
 use axon_transport::status::LinkStatus;
 use quinn_proto::{ConnectionHandle, StreamId, Transmit};
 use rustls_pki_types::CertificateDer;
@@ -14,6 +15,7 @@ use super::{
     answers::{AnswerWatch, Exchange},
     burst::DatagramBurst,
     control_stream::ControlStream,
+    copies::{CopyBatch, CopyStreams, SampleCopy},
     link_rate::LinkRate,
 };
 use crate::{
@@ -21,7 +23,8 @@ use crate::{
         congestion::marks::marks_reported,
         limits::{Egress, InterfaceLimits},
         rank::{Class, FlowId, Priorities, Rank},
-        sample::protection::Seal,
+        rings::RingSample,
+        sample::{frames::Frames, protection::Seal, stream_header::StreamHeader},
     },
     owner::{ChannelBinding, EXPORTER},
 };
@@ -78,8 +81,10 @@ pub(crate) struct Connection {
     pub(in crate::engine) deadline: Option<std::time::Instant>,
     /// The number of datagrams that arrived with an ECN mark.
     pub(in crate::engine) ecn_marks: u64,
-    /// Since when the peer has not answered, if it is in use and both hosts have two paths.
+    /// Since when the peer has not answered, if both hosts have two paths.
     pub(in crate::engine) watch: Option<AnswerWatch>,
+    /// The copies of samples in flight, which left while it stood by.
+    pub(in crate::engine) copies: CopyStreams,
 }
 
 impl Connection {
@@ -105,6 +110,7 @@ impl Connection {
             deadline: None,
             ecn_marks: 0,
             watch: None,
+            copies: CopyStreams::default(),
         }
     }
 
@@ -213,6 +219,7 @@ impl Connection {
             rate: self.rate.get(now).into_iter().chain(self.egress.rate()).reduce(f64::min),
             measured: &mut self.rate,
             burst: &mut self.burst,
+            copies: CopyBatch::default(),
         }
     }
 }
@@ -285,9 +292,32 @@ pub(crate) struct Carrier<'a> {
     pub(in crate::engine) rate: Option<f64>,
     measured: &'a mut LinkRate,
     burst: &'a mut DatagramBurst,
+    /// The copies that are to leave over the link that stands by.
+    pub(in crate::engine) copies: CopyBatch,
 }
 
 impl Carrier<'_> {
+    /// Copies a sample for the second path. A sample that has an envelope of its own is not copied: the envelope is
+    /// bound to its connection, and without one the sample would be less protected.
+    pub(in crate::engine) fn copy(
+        &mut self,
+        header: StreamHeader,
+        route: Route,
+        sample: &RingSample,
+        after: u64,
+        now: Duration,
+    ) {
+        if !matches!(self.seal, Seal::Link) {
+            return;
+        }
+        let mut frames = Frames::default();
+        let sealed = Seal::Link.write(sample, route, Delivery::Reliable, None, &mut frames, now);
+        if sealed.is_ok() {
+            let frames = frames.take();
+            self.copies.copies.push(SampleCopy { header, after, frames });
+        }
+    }
+
     /// Returns the congestion window in bytes.
     pub(in crate::engine) fn window(&self) -> u64 {
         self.window

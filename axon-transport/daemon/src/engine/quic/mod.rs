@@ -4,6 +4,7 @@ pub(crate) mod answers;
 pub(crate) mod burst;
 pub(crate) mod connection;
 pub(crate) mod control_stream;
+pub(crate) mod copies;
 pub(crate) mod endpoints;
 pub(crate) mod link_rate;
 pub(crate) mod qlog;

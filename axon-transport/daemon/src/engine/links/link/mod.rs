@@ -35,7 +35,7 @@ pub(super) enum LinkPhase {
     Opening(Box<Opening>),
     /// It waits for its election, until this time.
     Electing(Duration),
-    /// It stands by beside the link in use, over another path, and carries nothing.
+    /// It stands by beside the link in use, over another path, and carries copies alone.
     Standby,
     /// It carries samples.
     Open,
@@ -144,6 +144,12 @@ impl Link {
     /// Returns whether data may come over it: it is, or was, elected.
     pub(super) fn carries(&self) -> bool {
         matches!(self.phase, LinkPhase::Open | LinkPhase::Leaving(_))
+    }
+
+    /// Returns whether it stands by, and may carry copies of samples. They have no envelopes of their own.
+    pub(super) fn carries_copies(&self) -> bool {
+        let seals = self.peer.as_ref().is_none_or(|peer| peer.seals);
+        matches!(self.phase, LinkPhase::Standby) && !seals
     }
 
     /// Returns whether it carries samples.

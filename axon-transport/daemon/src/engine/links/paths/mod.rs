@@ -1,6 +1,7 @@
 //! Two paths to a peer: a second link stands by at another address of the peer, and takes over when the path of the
 //! link in use does not answer.
 
+mod copies;
 mod failover;
 mod peers;
 mod search;
@@ -31,6 +32,7 @@ use super::{
 };
 use crate::{
     engine::{
+        congestion::let_probe_through,
         link::target::DialTarget,
         links::LinkEvent,
         quic::{
@@ -145,6 +147,10 @@ impl Links {
         if let Some(paths) = self.paths.all.get_mut(&daemon) {
             paths.search.handle_found(now, address);
             paths.failover.handle_standby();
+        }
+        let exchange = self.exchange(number);
+        if let Some(connection) = self.connections.get_mut(number) {
+            connection.watch.get_or_insert_default().restart(exchange);
         }
         tracing::info!(peer = %daemon, %address, "a second link stands by");
         self.connections.touch(number);
@@ -279,13 +285,17 @@ impl Links {
 
     /// Records the answers of the peer of a link, whose connection had work.
     pub(super) fn note_answers(&mut self, number: u64, daemon: DaemonId, exchange: Exchange) {
-        if let Some(paths) = self.paths.all.get_mut(&daemon)
-            && self.table.current(daemon) == Some(number)
-            && paths.failover.handle_exchange(exchange)
-            && let Some(connection) = self.connections.get_mut(number)
-            && let Some(watch) = &mut connection.watch
-        {
-            watch.restart(exchange);
+        let Some(paths) = self.paths.all.get_mut(&daemon) else { return };
+        let in_use = self.table.current(daemon) == Some(number);
+        if !in_use && self.table.standby(daemon) != Some(number) {
+            return;
+        }
+        if in_use {
+            paths.failover.handle_exchange(exchange);
+        }
+        let connection = self.connections.get_mut(number);
+        if let Some(watch) = connection.and_then(|connection| connection.watch.as_mut()) {
+            watch.handle_exchange(exchange);
         }
     }
 
@@ -296,7 +306,8 @@ impl Links {
             let waits = self.dials.is_dialling(*daemon);
             let search = paths.search.poll_timeout().filter(|_| !waits);
             let search = search.map(|due| due.max(self.standby_silent_at(*daemon)));
-            [search, self.failover_timeout(*daemon, paths)].into_iter().flatten()
+            let copies = self.table.standby(*daemon).and_then(|number| self.copies_timeout(number));
+            [search, self.failover_timeout(*daemon, paths), copies].into_iter().flatten()
         });
         due.min()
     }
@@ -317,6 +328,7 @@ impl Links {
             let Some(number) = self.table.current(daemon) else { continue };
             if let Some(standby) = self.table.standby(daemon) {
                 self.compare_paths(daemon, number, standby, now);
+                self.look_at_copies(standby, now);
             }
             if self.standby_silent_at(daemon) <= now {
                 self.probe_paths(daemon, number, now);
@@ -342,6 +354,7 @@ impl Links {
             Some(FailoverStep::Ask) => {
                 if let Some(standby) = self.connections.get_mut(standby) {
                     standby.quic.ping();
+                    let_probe_through(&standby.quic);
                 }
                 self.connections.touch(standby);
             }
@@ -445,6 +458,7 @@ impl Links {
         let mut status = StandbyStatus::default();
         status.address = connection.quic.remote_address().to_string();
         status.rtt = connection.quic.rtt();
+        status.copies_out = connection.copies.sent();
         Some(status)
     }
 }

@@ -8,7 +8,8 @@ use axon_transport::config::TopicPriority;
 
 use crate::engine::{
     outbound::served::FlowRoute,
-    rank::{Class, Rank},
+    rank::{Class, Rank, SMALL},
+    rings::RingSample,
     sample::stream_header::StreamHeader,
 };
 
@@ -29,6 +30,8 @@ pub(in crate::engine::outbound) struct FlowInfo {
     /// True if its samples may be compressed. Without acknowledgements, a flow does not know when a stream with short
     /// headers may be followed by one without.
     pub(super) compressed: bool,
+    /// True if small samples may cross both paths. Without acknowledgements, the peer delivers a sample twice.
+    pub(super) redundant: bool,
 }
 
 impl FlowInfo {
@@ -43,6 +46,7 @@ impl FlowInfo {
             acknowledged: route.acknowledged,
             short_headers: route.short_headers,
             compressed: route.compressed && route.acknowledged,
+            redundant: route.redundant && route.acknowledged,
         }
     }
 
@@ -66,6 +70,7 @@ impl FlowInfo {
     pub(super) fn reliable_header(&self, short: bool) -> StreamHeader {
         StreamHeader {
             reliable: true,
+            copy: false,
             short,
             acknowledged: self.acknowledged && self.is_service(),
             route: self.route_number,
@@ -73,9 +78,19 @@ impl FlowInfo {
         }
     }
 
+    /// Returns whether a sample also leaves over the second path, if there is one.
+    pub(super) fn is_copied(&self, sample: &RingSample) -> bool {
+        self.redundant && !sample.is_compressed() && sample.payload.len() <= SMALL
+    }
+
+    /// Returns the header of the stream of a RELIABLE sample's copy.
+    pub(super) fn copy_header(&self) -> StreamHeader {
+        StreamHeader { copy: true, ..self.reliable_header(false) }
+    }
+
     /// Returns the header of the stream of one BEST_EFFORT sample.
     pub(super) fn best_effort_header(&self, short: bool) -> StreamHeader {
         let (route, of) = (self.route_number, self.of);
-        StreamHeader { reliable: false, short, acknowledged: false, route, of }
+        StreamHeader { reliable: false, copy: false, short, acknowledged: false, route, of }
     }
 }

@@ -31,6 +31,8 @@ use crate::{
 pub(super) const TOGETHER: usize = 64 << 10;
 /// Maximum length of a sample that is copied into one piece with its neighbours.
 const COPIED: usize = 4096;
+/// Maximum number of samples that wait together and are copied for the second path. More are bulk.
+const LONE: u64 = 8;
 /// Bytes that count as progress of a long sample, if QUIC took them for the first time.
 const PART: u64 = 256 << 10;
 /// Time after which an idle stream is finished.
@@ -271,6 +273,7 @@ impl ReliableStream {
             if !queue.peek().is_some_and(is_next) {
                 break;
             }
+            let (after, is_lone) = (queue.newest_sent(), queue.waiting() <= LONE);
             let Some(sample) = queue.send() else { break };
             let (sequence, length) = (sample.info.sequence, sample.length());
             let payload = sample.payload.len();
@@ -282,6 +285,10 @@ impl ReliableStream {
                     return Err(why);
                 }
                 break;
+            }
+            let is_first_time = after < sequence;
+            if is_lone && is_first_time && carrier.copies.has_room() && info.is_copied(sample) {
+                carrier.copy(info.copy_header(), info.route, sample, after, now);
             }
             end = frames.len() as u64;
             bytes += payload;

@@ -168,6 +168,7 @@ impl Torture {
             of: self.gid(),
             route: self.number() as u32,
             reliable: self.rng.random_bool(0.7),
+            copy: self.rng.random_bool(0.2),
             short: self.rng.random_bool(0.3),
             acknowledged: self.rng.random_bool(0.3),
         };

@@ -116,8 +116,7 @@ fn samples_follow_the_header_on_one_stream_and_stay_until_they_are_acknowledged(
     let (bytes, is_finished) = way.pair.read(stream).unwrap();
     let header = way.info.reliable_header(false).encode();
     assert_eq!(bytes[..header.len()], header);
-    let parsed =
-        StreamHeader { reliable: true, short: false, acknowledged: false, route: 7, of: PUBLISHER };
+    let parsed = StreamHeader::plain(7, PUBLISHER);
     assert_eq!(header, parsed.encode());
     let each = (bytes.len() - header.len()) / 5;
     let last: Vec<_> = bytes[header.len()..].chunks(each).map(|frame| frame[each - 1]).collect();

@@ -30,6 +30,9 @@ struct TwoPaths {
     addresses: [Ipv4Addr; 2],
     /// Time between two samples of a publisher, in milliseconds. The history has 256.
     every: u32,
+    /// The time of publication and the age at arrival of each sample, by publisher, in milliseconds.
+    published_at: [Vec<u64>; 2],
+    ages: [Vec<u64>; 2],
 }
 
 /// Returns settings with this number of paths.
@@ -70,7 +73,8 @@ impl TwoPaths {
         world.hear_all_addresses();
         world.run_for(secs(4));
         let addresses = [world.hosts[1].address, second];
-        Self { world, pairs, published: [0; 2], addresses, every: 10 }
+        let [published_at, ages] = [[Vec::new(), Vec::new()], [Vec::new(), Vec::new()]];
+        Self { world, pairs, published: [0; 2], addresses, every: 10, published_at, ages }
     }
 
     /// Returns which path host 0 uses.
@@ -92,25 +96,43 @@ impl TwoPaths {
     fn publish(&mut self, time: Duration) -> Duration {
         let end = self.world.now + time;
         let mut gap = Duration::ZERO;
-        let mut last = [(self.world.now, 0); 2];
+        let before = self.pairs.map(|pair| self.world.received(pair).len());
+        let mut last = before.map(|received| (self.world.now, received));
         while self.world.now < end {
-            for (pair, published) in self.pairs.iter().zip(&mut self.published) {
-                let published_one = self.world.publish(*pair, 1000);
+            for (side, pair) in self.pairs.into_iter().enumerate() {
+                let published_one = self.world.publish(pair, 1000);
                 assert!(published_one, "the history is full: {}", self.world.describe());
-                *published += 1;
+                self.published[side] += 1;
+                self.published_at[side].push(self.world.now.as_millis() as u64);
             }
             for _ in 0..self.every {
                 self.world.run_for(millis(1));
-                for (pair, last) in self.pairs.iter().zip(&mut last) {
-                    let received = self.world.received(*pair).len();
+                for (side, last) in last.iter_mut().enumerate() {
+                    let received = self.world.received(self.pairs[side]).len();
                     if received > last.1 {
                         *last = (self.world.now, received);
                     }
                     gap = gap.max(self.world.now - last.0);
+                    self.note_ages(side, received);
                 }
             }
         }
         gap
+    }
+
+    /// Notes the ages of the samples that arrived in the last millisecond.
+    fn note_ages(&mut self, side: usize, received: usize) {
+        let now = self.world.now.as_millis() as u64;
+        for sample in self.ages[side].len()..received.min(self.published_at[side].len()) {
+            self.ages[side].push(now - self.published_at[side][sample]);
+        }
+    }
+
+    /// Returns the age at arrival, in milliseconds, that this share of all samples did not exceed.
+    fn age_of(&self, share: f64) -> u64 {
+        let mut ages = self.ages.concat();
+        ages.sort_unstable();
+        ages[((ages.len() - 1) as f64 * share) as usize]
     }
 
     /// Everything arrives, once and in order, and no host took the other one for gone.
@@ -159,7 +181,10 @@ fn paths_that_are_cut_in_turn_at_random_lose_nothing() {
             paths.set_path(path, true);
             longest = longest.max(paths.publish(millis(random.random_range(1000..4000))));
         }
-        println!("{mode}: nothing arrived for {longest:?} at most");
+        let [p50, p99, p999] = [0.5, 0.99, 0.999].map(|share| paths.age_of(share));
+        println!(
+            "{mode}: nothing arrived for {longest:?} at most; ages p50 {p50} ms, p99 {p99} ms, p99.9 {p999} ms"
+        );
         assert!(longest <= SWITCHED, "{mode}: nothing arrived for {longest:?}");
         paths.is_complete(mode);
     }

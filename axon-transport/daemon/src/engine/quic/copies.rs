@@ -1,0 +1,192 @@
+//! Copies of small samples over the link that stands by.
+//!
+//! A RELIABLE sample waits for the take-over if its path is cut while it is on its way. So a small one also leaves over
+//! the second path, and the peer delivers whichever arrives first. A copy is a help and no promise: it is left out while
+//! the second path is silent or has many copies in flight.
+
+use std::time::Duration;
+
+use axon_shm::ids::Gid;
+use bytes::Bytes;
+use quinn_proto::{Connection, Dir, StreamId, VarInt};
+
+use crate::{engine::sample::stream_header::StreamHeader, link::CloseCode};
+
+/// Maximum number of copies in flight. A peer reads fewer streams at a time before a link is elected.
+const MOST: usize = 96;
+/// Maximum number of copies in flight of one flow, so that a fast flow leaves some to the others.
+const MOST_OF_FLOW: usize = 32;
+/// Time without an answer, and number of round trips, after which the second path counts as silent.
+const SILENT: Duration = Duration::from_millis(100);
+const ROUND_TRIPS: u32 = 3;
+/// Interval of the PINGs over a silent path, in the first seconds of the silence and later. The first PING that is
+/// answered shows that the path works again.
+const FIRST_PINGS: (Duration, Duration) = (Duration::from_secs(10), Duration::from_millis(100));
+const PING: Duration = Duration::from_secs(1);
+/// Time after which a copy is given up. Its sample has arrived over the link in use, or the link that stands by has
+/// taken over and sent the sample itself.
+const LIFE: Duration = Duration::from_secs(1);
+
+/// A copy that is to leave.
+#[derive(Debug)]
+pub(in crate::engine) struct SampleCopy {
+    /// The header of its stream.
+    pub(in crate::engine) header: StreamHeader,
+    /// The number of the sample that was sent before it in its flow.
+    pub(in crate::engine) after: u64,
+    /// The message behind its length.
+    pub(in crate::engine) frames: Vec<Bytes>,
+}
+
+/// The copies of one pass.
+#[derive(Debug, Default)]
+pub(in crate::engine) struct CopyBatch {
+    /// Number of copies that the second path takes.
+    pub(in crate::engine) room: usize,
+    pub(in crate::engine) copies: Vec<SampleCopy>,
+}
+
+impl CopyBatch {
+    /// Returns whether the second path takes one more copy.
+    pub(in crate::engine) fn has_room(&self) -> bool {
+        self.copies.len() < self.room
+    }
+}
+
+/// A copy in flight.
+#[derive(Debug)]
+struct SentCopy {
+    stream: StreamId,
+    of: (u32, Gid),
+    sent_at: Duration,
+    bytes: usize,
+}
+
+/// The copies in flight over one connection.
+#[derive(Debug, Default)]
+pub(in crate::engine) struct CopyStreams {
+    in_flight: Vec<SentCopy>,
+    bytes: usize,
+    /// Number of copies that left.
+    sent: u64,
+    ping_at: Option<Duration>,
+}
+
+impl CopyStreams {
+    /// Returns the number of copies that may leave now. `since`: since when the peer has not answered over this
+    /// connection.
+    pub(in crate::engine) fn room(
+        &self,
+        quic: &Connection,
+        since: Option<Duration>,
+        now: Duration,
+    ) -> usize {
+        // A PING, and the first packets after a take-over, always fit into the congestion window.
+        let fits = (self.bytes as u64) < quic.congestion_state().window() / 2;
+        if is_silent(since, quic.rtt(), now) || !fits { 0 } else { MOST - self.in_flight.len() }
+    }
+
+    /// Sends a copy in a stream of its own.
+    pub(in crate::engine) fn send(
+        &mut self,
+        quic: &mut Connection,
+        copy: &mut SampleCopy,
+        now: Duration,
+    ) {
+        let of = (copy.header.route, copy.header.of);
+        let of_flow = self.in_flight.iter().filter(|sent| sent.of == of).count();
+        if self.in_flight.len() >= MOST || of_flow >= MOST_OF_FLOW {
+            return;
+        }
+        let Some(stream) = quic.streams().open(Dir::Uni) else { return };
+        let mut start = copy.header.encode().to_vec();
+        start.extend_from_slice(&copy.after.to_be_bytes());
+        let mut chunks = vec![Bytes::from(start)];
+        chunks.append(&mut copy.frames);
+        let bytes = chunks.iter().map(Bytes::len).sum();
+        let written = quic.send_stream(stream).write_chunks(&mut chunks).map(|taken| taken.bytes);
+        if written != Ok(bytes) {
+            reset(quic, stream);
+            return;
+        }
+        let _ = quic.send_stream(stream).finish();
+        self.in_flight.push(SentCopy { stream, of, sent_at: now, bytes });
+        (self.bytes, self.sent) = (self.bytes + bytes, self.sent + 1);
+    }
+
+    /// Handles that a stream is over: the peer acknowledged all of it. Returns whether it was
+    /// that of a copy.
+    pub(in crate::engine) fn handle_over(&mut self, stream: StreamId) -> bool {
+        let Some(at) = self.in_flight.iter().position(|sent| sent.stream == stream) else {
+            return false;
+        };
+        self.bytes -= self.in_flight.remove(at).bytes;
+        true
+    }
+
+    /// Handles that the peer wants no more of a stream. Returns whether it was that of a copy.
+    pub(in crate::engine) fn handle_stopped(
+        &mut self,
+        quic: &mut Connection,
+        stream: StreamId,
+    ) -> bool {
+        let is_copy = self.handle_over(stream);
+        if is_copy {
+            reset(quic, stream);
+        }
+        is_copy
+    }
+
+    /// Returns the number of copies that left.
+    pub(in crate::engine) fn sent(&self) -> u64 {
+        self.sent
+    }
+
+    /// Returns when [`handle_timeout`](Self::handle_timeout) is due.
+    pub(in crate::engine) fn poll_timeout(
+        &self,
+        since: Option<Duration>,
+        round_trip: Duration,
+    ) -> Option<Duration> {
+        let over = self.in_flight.first().map(|oldest| oldest.sent_at + LIFE);
+        let silent = since.map(|since| since + silent_after(round_trip));
+        let ping = silent.map(|silent| self.ping_at.map_or(silent, |ping| ping.max(silent)));
+        [over, ping].into_iter().flatten().min()
+    }
+
+    /// Gives up old copies. Returns whether a PING is due.
+    pub(in crate::engine) fn handle_timeout(
+        &mut self,
+        quic: &mut Connection,
+        since: Option<Duration>,
+        now: Duration,
+    ) -> bool {
+        while let Some(oldest) = self.in_flight.first()
+            && oldest.sent_at + LIFE <= now
+        {
+            reset(quic, oldest.stream);
+            self.bytes -= oldest.bytes;
+            self.in_flight.remove(0);
+        }
+        let Some(since) = since.filter(|_| is_silent(since, quic.rtt(), now)) else { return false };
+        if self.ping_at.is_some_and(|ping| now < ping) {
+            return false;
+        }
+        let is_first = now < since + FIRST_PINGS.0;
+        self.ping_at = Some(now + if is_first { FIRST_PINGS.1 } else { PING });
+        true
+    }
+}
+
+fn silent_after(round_trip: Duration) -> Duration {
+    SILENT.max(ROUND_TRIPS * round_trip)
+}
+
+fn is_silent(since: Option<Duration>, round_trip: Duration, now: Duration) -> bool {
+    since.is_some_and(|since| since + silent_after(round_trip) <= now)
+}
+
+fn reset(quic: &mut Connection, stream: StreamId) {
+    // An error means that the stream is over.
+    let _ = quic.send_stream(stream).reset(VarInt::from_u32(CloseCode::Goodbye.code()));
+}
