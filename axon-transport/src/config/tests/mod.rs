@@ -466,6 +466,7 @@ fn the_first_entry_of_a_topic_counts() {
         [[topic]]
         name = "/tf"
         max_hz = 12.5
+        redundant = false
         "#,
     )
     .unwrap();
@@ -478,5 +479,6 @@ fn the_first_entry_of_a_topic_counts() {
         ("/scan", TopicPriority::Normal),
     ] {
         assert_eq!(config.topic_priority(name), priority, "{name}");
+        assert_eq!(config.topic_redundancy(name), name != "/tf", "{name}");
     }
 }

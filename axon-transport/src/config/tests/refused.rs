@@ -311,6 +311,8 @@ fn files_that_are_not_a_configuration_are_refused() {
         ("[[topic]]\nname = '/a'\nmax_hz = 0", "topic.max_hz"),
         ("[[topic]]\nname = '/a'\nmax_hz = '10'", "topic.max_hz"),
         ("[[topic]]\nname = '/a'\nmax_hz = inf", "topic.max_hz"),
+        ("[[topic]]\nname = '/a'\nredundant = 1", "topic.redundant"),
+        ("[[topic]]\nname = '/a'\nredundant = 'yes'", "topic.redundant"),
         ("[linc]\nmtu = 1500", "AXON_LINC"),
     ] {
         let error = with_file(&[], text).unwrap_err();

@@ -76,6 +76,11 @@ impl Egress {
         self.peer = caps;
     }
 
+    /// Replaces the limits on what is sent to the peer by those of another connection to it.
+    pub(crate) fn share_peer(&mut self, other: &Self) {
+        self.peer.clone_from(&other.peer);
+    }
+
     /// Replaces the limits on what leaves by the interface with this address.
     pub(crate) fn set_interface(&mut self, limits: &InterfaceLimits, local: IpAddr) {
         self.interface = limits.of(local).to_vec();

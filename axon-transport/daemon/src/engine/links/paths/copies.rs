@@ -39,7 +39,13 @@ impl Links {
         let Some(number) = self.table.standby(daemon).filter(|_| !copies.is_empty()) else {
             return;
         };
+        let in_use = self.table.current(daemon).and_then(|number| self.connections.get(number));
+        let egress = in_use.map(|connection| connection.egress.clone());
         let Some(standby) = self.connections.get_mut(number) else { return };
+        // The limits on what leaves for the peer hold for both links together.
+        if let Some(egress) = egress {
+            standby.egress.share_peer(&egress);
+        }
         for copy in &mut copies {
             standby.copies.send(&mut standby.quic, copy, now);
         }

@@ -5,7 +5,10 @@
 use std::{net::Ipv4Addr, time::Duration};
 
 use axon_shm::qos::Qos;
-use axon_transport::config::{Config, KeyMode, Security};
+use axon_transport::{
+    access::TopicPattern,
+    config::{Config, KeyMode, Security, TopicPriority, TopicRule},
+};
 use rand::RngExt;
 
 use crate::engine::{
@@ -186,6 +189,69 @@ fn paths_that_are_cut_in_turn_at_random_lose_nothing() {
             "{mode}: nothing arrived for {longest:?} at most; ages p50 {p50} ms, p99 {p99} ms, p99.9 {p999} ms"
         );
         assert!(longest <= SWITCHED, "{mode}: nothing arrived for {longest:?}");
+        if mode != "messages10" {
+            // No sample waits for a take-over: it crosses both paths.
+            assert!(p99 < 30, "{mode}: {p99} ms");
+        }
+        paths.is_complete(mode);
+    }
+}
+
+/// Returns the copies that host 0 sent, and the samples that it received as copies first.
+fn copies(paths: &TwoPaths) -> (u64, u64) {
+    let links: Vec<_> = paths.world.hosts[0].status.values().collect();
+    let sent =
+        links.iter().filter_map(|link| link.standby.as_ref()).map(|standby| standby.copies_out);
+    (sent.sum(), links.iter().map(|link| link.copies_in).sum())
+}
+
+#[test]
+fn small_samples_cross_both_paths_unless_they_have_envelopes_or_a_rule() {
+    for (mode, config) in modes() {
+        for redundant in [true, false] {
+            let config = with_paths(&config, |_| 2);
+            let mut paths = TwoPaths::with(72, |host| {
+                let mut config = config(host);
+                let name = TopicPattern::new("/*").unwrap();
+                let rule = TopicRule::new(name, TopicPriority::Normal);
+                config.topics = vec![if redundant { rule } else { rule.over_one_path() }];
+                config
+            });
+            paths.publish(secs(3));
+            let (sent, _) = copies(&paths);
+            let expected = redundant && mode != "messages10";
+            assert_eq!(sent > 200, expected, "{mode}, {redundant}: {sent}");
+            assert!(sent > 200 || sent == 0, "{mode}, {redundant}: {sent}");
+            // The link in use loses half of its packets: copies come first.
+            let bad = Path { loss: 0.5, delay: millis(2), ..Path::default() };
+            let ends = [0, 1].map(|host| paths.world.hosts[host].address);
+            for (from, to) in [(0, 1), (1, 0)] {
+                paths.world.network.set_path_between(ends[from], ends[to], Some(bad.clone()));
+            }
+            paths.publish(secs(3));
+            let (_, first) = copies(&paths);
+            assert_eq!(first > 50, expected, "{mode}, {redundant}: {first}");
+            paths.is_complete(mode);
+        }
+    }
+}
+
+#[test]
+fn lossy_paths_that_are_cut_in_turn_lose_nothing_and_repeat_nothing() {
+    for (mode, config) in modes() {
+        let mut paths = TwoPaths::new(73, &config);
+        paths.every = 20;
+        let lossy = Path { loss: 0.2, jitter: millis(8), delay: millis(2), ..Path::default() };
+        paths.world.network.set_default_path(lossy);
+        let mut random = stream(73, Stream::Script);
+        for _ in 0..15 {
+            let path = random.random_range(0..2);
+            paths.set_path(path, false);
+            paths.publish(millis(random.random_range(50..1500)));
+            paths.set_path(path, true);
+            paths.publish(millis(random.random_range(2000..5000)));
+        }
+        println!("{mode}: ages p50 {} ms, p99 {} ms", paths.age_of(0.5), paths.age_of(0.99));
         paths.is_complete(mode);
     }
 }
