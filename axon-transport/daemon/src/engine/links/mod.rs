@@ -491,6 +491,7 @@ impl Links {
         if let Some(look) = self.looks.take_due(now) {
             self.close_untrusted(look.at_certificates, now);
             self.look_for_silence(now);
+            self.choose_paths(now);
             self.widen_all(now);
         }
         self.look_at_paths(now);

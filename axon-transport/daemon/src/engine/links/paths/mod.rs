@@ -1,6 +1,7 @@
 //! Two paths to a peer: a second link stands by at another address of the peer, and takes over when the path of the
 //! link in use does not answer.
 
+mod choice;
 mod copies;
 mod failover;
 mod peers;
@@ -17,6 +18,7 @@ use rand::RngExt;
 
 pub(super) use self::peers::PeerPaths;
 use self::{
+    choice::{PathChoice, PathQuality},
     failover::{Failover, FailoverStep},
     peers::Paths,
     search::{PathSearch, is_other},
@@ -147,6 +149,7 @@ impl Links {
         if let Some(paths) = self.paths.all.get_mut(&daemon) {
             paths.search.handle_found(now, address);
             paths.failover.handle_standby();
+            paths.choice.handle_links();
         }
         let exchange = self.exchange(number);
         if let Some(connection) = self.connections.get_mut(number) {
@@ -167,8 +170,10 @@ impl Links {
         let paths = self.paths.all.entry(daemon).or_insert_with(|| Paths {
             search: PathSearch::new(elects, now),
             failover: Failover::default(),
+            choice: PathChoice::default(),
         });
         paths.failover = Failover::new(exchange);
+        paths.choice.handle_links();
         paths.search.forget_answers();
         if let Some(connection) = self.connections.get_mut(number) {
             connection.watch.get_or_insert_default().restart(exchange);
@@ -361,11 +366,38 @@ impl Links {
             Some(FailoverStep::Switch) => {
                 tracing::info!(peer = %daemon,
                     "the path does not answer and the second one does: the second link takes over");
-                if self.hello.daemon < daemon {
-                    self.put_standby_in_use(standby, now);
-                } else {
-                    self.send(standby, &LinkMessage::SwitchOver, now);
-                }
+                self.switch_over(daemon, standby, now);
+            }
+        }
+    }
+
+    /// Puts the link that stands by in use, or asks the side that elects links for it.
+    fn switch_over(&mut self, daemon: DaemonId, standby: u64, now: Duration) {
+        if self.hello.daemon < daemon {
+            self.put_standby_in_use(standby, now);
+        } else {
+            self.send(standby, &LinkMessage::SwitchOver, now);
+        }
+    }
+
+    /// Compares the two paths to each peer, once a second.
+    pub(super) fn choose_paths(&mut self, now: Duration) {
+        for daemon in self.paths.all.keys().copied().collect::<Vec<_>>() {
+            let (Some(number), Some(standby)) =
+                (self.table.current(daemon), self.table.standby(daemon))
+            else {
+                continue;
+            };
+            let quality = |number| self.connections.get(number).map(path_quality);
+            let (Some(in_use), Some(second)) = (quality(number), quality(standby)) else {
+                continue;
+            };
+            let Some(paths) = self.paths.all.get_mut(&daemon) else { continue };
+            if paths.choice.handle_second(now, in_use, second) {
+                let (before, after) = (in_use.round_trip, second.round_trip);
+                tracing::info!(peer = %daemon, ?before, ?after,
+                    "the second path is better: the second link takes over");
+                self.switch_over(daemon, standby, now);
             }
         }
     }
@@ -461,6 +493,13 @@ impl Links {
         status.copies_out = connection.copies.sent();
         Some(status)
     }
+}
+
+/// Returns what QUIC measured of the path of a connection.
+fn path_quality(connection: &Connection) -> PathQuality {
+    let path = connection.quic.stats().path;
+    let round_trip = connection.quic.min_rtt();
+    PathQuality { round_trip, sent: path.sent_packets, lost: path.lost_packets }
 }
 
 /// Returns whether two local addresses are probably of different interfaces. An interface often has an address of either

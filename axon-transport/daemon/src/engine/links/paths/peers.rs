@@ -4,7 +4,7 @@ use std::collections::HashMap;
 
 use axon_shm::ids::DaemonId;
 
-use super::{failover::Failover, search::PathSearch};
+use super::{choice::PathChoice, failover::Failover, search::PathSearch};
 
 /// The paths to the peers that may have two links at a time.
 #[derive(Default)]
@@ -16,4 +16,5 @@ pub(in crate::engine::links) struct PeerPaths {
 pub(super) struct Paths {
     pub(super) search: PathSearch,
     pub(super) failover: Failover,
+    pub(super) choice: PathChoice,
 }

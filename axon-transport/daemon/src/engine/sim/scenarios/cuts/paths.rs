@@ -31,6 +31,8 @@ struct TwoPaths {
     published: [u64; 2],
     /// The addresses of host 1, by path.
     addresses: [Ipv4Addr; 2],
+    /// The addresses of both hosts on the second path.
+    second: [Ipv4Addr; 2],
     /// Time between two samples of a publisher, in milliseconds. The history has 256.
     every: u32,
     /// The time of publication and the age at arrival of each sample, by publisher, in milliseconds.
@@ -67,17 +69,27 @@ impl TwoPaths {
     }
 
     fn with(seed: u64, config: impl Fn(usize) -> Config) -> Self {
+        Self::over(seed, config, Path { delay: millis(2), ..Path::default() })
+    }
+
+    /// Links two hosts over a first path of this quality.
+    fn over(seed: u64, config: impl Fn(usize) -> Config, first: Path) -> Self {
         let mut world = World::new(seed, 2, config);
         world.network.set_default_path(Path { delay: millis(2), ..Path::default() });
-        let second = [0, 1].map(|host| world.add_second_interface(host))[1];
+        let ends = [0, 1].map(|host| world.hosts[host].address);
+        for (from, to) in [(0, 1), (1, 0)] {
+            world.network.set_path_between(ends[from], ends[to], Some(first.clone()));
+        }
+        let second = [0, 1].map(|host| world.add_second_interface(host));
         let pairs =
             [world.pair(0, 1, "/out", Qos::keep_all()), world.pair(1, 0, "/in", Qos::keep_all())];
         world.until(secs(20), World::is_whole);
         world.hear_all_addresses();
         world.run_for(secs(4));
-        let addresses = [world.hosts[1].address, second];
+        let addresses = [world.hosts[1].address, second[1]];
         let [published_at, ages] = [[Vec::new(), Vec::new()], [Vec::new(), Vec::new()]];
-        Self { world, pairs, published: [0; 2], addresses, every: 10, published_at, ages }
+        let (published, every) = ([0; 2], 10);
+        Self { world, pairs, published, addresses, second, every, published_at, ages }
     }
 
     /// Returns which path host 0 uses.
@@ -252,6 +264,50 @@ fn lossy_paths_that_are_cut_in_turn_lose_nothing_and_repeat_nothing() {
             paths.publish(millis(random.random_range(2000..5000)));
         }
         println!("{mode}: ages p50 {} ms, p99 {} ms", paths.age_of(0.5), paths.age_of(0.99));
+        paths.is_complete(mode);
+    }
+}
+
+#[test]
+fn better_path_is_used_and_a_worse_one_is_left() {
+    for (mode, config) in modes() {
+        let mut paths = TwoPaths::new(74, &config);
+        let set = |paths: &mut TwoPaths, path: usize, quality: &Path| {
+            let ends = match path {
+                0 => [0, 1].map(|host| paths.world.hosts[host].address),
+                _ => paths.second,
+            };
+            for (from, to) in [(0, 1), (1, 0)] {
+                let quality = Some(quality.clone());
+                paths.world.network.set_path_between(ends[from], ends[to], quality);
+            }
+        };
+        paths.publish(secs(20));
+        assert_eq!(paths.in_use(), 0, "{mode}: both paths are alike");
+        // The path in use loses a third of its packets.
+        set(&mut paths, 0, &Path { loss: 0.3, delay: millis(2), ..Path::default() });
+        paths.publish(secs(40));
+        // Copies show how much the second path loses. In messages10 there are none.
+        let expected = usize::from(mode != "messages10");
+        assert_eq!(paths.in_use(), expected, "{mode}: {}", paths.world.describe());
+        set(&mut paths, 0, &Path { delay: millis(2), ..Path::default() });
+        paths.publish(secs(70));
+        assert_eq!(paths.in_use(), expected, "{mode}: both paths are alike again");
+        paths.is_complete(mode);
+    }
+}
+
+#[test]
+fn shorter_path_is_used() {
+    for (mode, config) in modes() {
+        let slow = Path { delay: millis(20), ..Path::default() };
+        let mut paths = TwoPaths::over(75, with_paths(&config, |_| 2), slow);
+        // The second path has the usual delay.
+        paths.publish(secs(20));
+        assert_eq!(paths.in_use(), 1, "{mode}: {}", paths.world.describe());
+        assert_eq!(paths.stands_by(), [true; 2], "{mode}: {}", paths.world.describe());
+        paths.publish(secs(100));
+        assert_eq!(paths.in_use(), 1, "{mode}: it stays");
         paths.is_complete(mode);
     }
 }
