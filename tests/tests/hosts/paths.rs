@@ -1,7 +1,7 @@
 //! Two paths between two hosts: a second link stands by, and takes over when the path of the first is cut.
 
 use std::{
-    thread::sleep,
+    thread::{self, sleep},
     time::{Duration, Instant},
 };
 
@@ -37,8 +37,14 @@ fn stands_by(host: &Host) -> bool {
     host.status().links.iter().any(|link| link.standby.is_some())
 }
 
-/// Publishes 100 samples a second of 1 KB while one path after the other is cut and comes back.
-fn outlasts_cuts_of_either_path(settings: [Settings; 2]) {
+/// Returns the samples and calls that a host received over the second path first.
+fn copies(host: &Host) -> u64 {
+    host.link().copies_in
+}
+
+/// Publishes 100 samples a second of 1 KB while one path after the other is cut and comes back. Returns the samples that
+/// came over the second path first.
+fn outlasts_cuts_of_either_path(settings: [Settings; 2]) -> u64 {
     let (hosts, wires) = wired_twice(settings);
     let spec = || EndpointSpec::new("/paths", "test/Bytes", Qos::keep_all());
     let (here, there) = (hosts[0].session("publisher"), hosts[1].session("subscription"));
@@ -79,25 +85,92 @@ fn outlasts_cuts_of_either_path(settings: [Settings; 2]) {
     for host in &hosts {
         assert_eq!(host.log_lines(&["link down"]), 0, "the link never ended");
     }
+    copies(&hosts[1])
 }
 
 #[test]
 fn in_classic_traffic_outlasts_cuts_of_either_path() {
-    outlasts_cuts_of_either_path([classic(&[TWO]), classic(&[TWO])]);
+    let copies = outlasts_cuts_of_either_path([classic(&[TWO]), classic(&[TWO])]);
+    assert!(copies > 20, "{copies} samples came over the second path during the cuts");
 }
 
 #[test]
 fn in_session_traffic_outlasts_cuts_of_either_path() {
     let kmes = Kmes::start();
     let more = [TWO, ("AXON_QKD_KEY_MODE", "session")];
-    outlasts_cuts_of_either_path([0, 1].map(|host| kmes.settings(host, &more)));
+    let copies = outlasts_cuts_of_either_path([0, 1].map(|host| kmes.settings(host, &more)));
+    assert!(copies > 20, "{copies} samples came over the second path during the cuts");
 }
 
 #[test]
 fn in_messages10_traffic_outlasts_cuts_of_either_path() {
     let kmes = Kmes::start();
     let more = [TWO, ("AXON_QKD_KEY_MODE", "messages10")];
-    outlasts_cuts_of_either_path([0, 1].map(|host| kmes.settings(host, &more)));
+    let copies = outlasts_cuts_of_either_path([0, 1].map(|host| kmes.settings(host, &more)));
+    assert_eq!(copies, 0, "a copy would leave without an envelope");
+}
+
+/// Calls a service 100 times a second, with up to ten calls under way, while one path after the other is cut.
+fn calls_outlast_cuts_of_either_path(settings: [Settings; 2]) {
+    let (hosts, wires) = wired_twice(settings);
+    let spec = || EndpointSpec::new("/echo", "test/Echo", Qos::keep_all());
+    let (here, there) = (hosts[0].session("client"), hosts[1].session("server"));
+    let server = there.create_server(spec()).unwrap();
+    let client = here.create_client(spec()).unwrap();
+    assert!(client.wait_available(PATIENCE));
+    let answering = thread::spawn(move || {
+        let (mut served, mut bytes) = (0, Vec::new());
+        while let Ok(request) = server.recv_request(&mut bytes, Some(PATIENCE)) {
+            served += 1;
+            assert_eq!(request.sequence, served, "each call once, and in order");
+            server.send_response(request.publisher, request.sequence, &bytes).unwrap();
+            if bytes == b"last" {
+                break;
+            }
+        }
+        served
+    });
+    let (mut called, mut answered, mut bytes) = (0, 0, Vec::new());
+    let take = |answered: &mut u64, bytes: &mut Vec<u8>| {
+        while let Some(info) = client.take_response(bytes) {
+            *answered += 1;
+            assert_eq!(info.sequence, *answered, "each response once");
+        }
+    };
+    for _ in 0..4 {
+        until("a second link stands by", || hosts.iter().all(stands_by));
+        let path = in_use(&hosts[0], &wires);
+        wires[path].cut();
+        let begun = Instant::now();
+        while begun.elapsed() < Duration::from_secs(1) {
+            if called < answered + 10 {
+                called = client.send_request(b"call").unwrap();
+            }
+            sleep(Duration::from_millis(10));
+            take(&mut answered, &mut bytes);
+        }
+        until("the other path carries the link", || in_use(&hosts[0], &wires) != path);
+        wires[path].mend();
+    }
+    called = client.send_request(b"last").unwrap();
+    assert_eq!(answering.join().unwrap(), called);
+    until("all calls are answered", || {
+        take(&mut answered, &mut bytes);
+        answered == called
+    });
+    assert!(hosts.iter().all(|host| copies(host) > 0), "calls and responses cross both paths");
+}
+
+#[test]
+fn in_classic_calls_cross_both_paths_and_none_is_served_twice() {
+    calls_outlast_cuts_of_either_path([classic(&[TWO]), classic(&[TWO])]);
+}
+
+#[test]
+fn in_session_calls_cross_both_paths_and_none_is_served_twice() {
+    let kmes = Kmes::start();
+    let more = [TWO, ("AXON_QKD_KEY_MODE", "session")];
+    calls_outlast_cuts_of_either_path([0, 1].map(|host| kmes.settings(host, &more)));
 }
 
 #[test]
