@@ -666,8 +666,9 @@ typedef void (*axon_endpoint_visitor_t)(void *user, const struct axon_endpoint_t
  *
  * The library calls the function on a thread of its own, for one line after the other. The thread starts
  * with the first line. It has no other work and holds no lock that the program may wait for. Therefore the
- * function may block and may call this interface. Up to 256 lines are queued meanwhile. Of further lines
- * only the number is reported. Lines that the library logs on this thread during the function are dropped.
+ * function may block and may call this interface. Up to 256 lines are queued meanwhile. A full
+ * queue drops the line of the lowest severity, and reports the number of dropped lines at the severity of the
+ * most severe of them. Lines that the library logs on this thread during the function are dropped.
  */
 typedef void (*axon_log_t)(const void *user, uint32_t severity, const char *part, const char *text);
 

@@ -276,14 +276,14 @@ fn attaching_again_changes_only_the_subscriptions_a_relay_represents() {
     };
     assert!(!writer.has_readers());
     let grant = writer.attach(info.clone()).unwrap();
-    assert_eq!(writer.readers(), [info.gid]);
+    assert_eq!((writer.readers(), writer.reader_count()), (vec![info.gid], 1));
     writer.publish(meta(0), b"x").unwrap();
     info.stands_for = Some(Vec::new());
     assert_eq!(writer.attach(info.clone()).unwrap(), grant);
-    assert_eq!(writer.readers(), [], "it stands for nobody");
+    assert_eq!((writer.readers(), writer.reader_count()), (vec![], 0), "it stands for nobody");
     info.stands_for = Some(relayed.clone());
     assert_eq!(writer.attach(info.clone()).unwrap(), grant);
-    assert_eq!(writer.readers(), relayed);
+    assert_eq!((writer.readers(), writer.reader_count()), (relayed.clone(), relayed.len()));
     // Another lane is another attachment.
     info.lane = lanes[1].location();
     let other = writer.attach(info.clone()).unwrap();

@@ -291,6 +291,11 @@ impl Writer {
         if self.is_forked() { Vec::new() } else { self.lock().reader_set.readers() }
     }
 
+    /// Counts the attached subscriptions as [`readers`](Self::readers) lists them. Allocates nothing.
+    pub fn reader_count(&self) -> usize {
+        if self.is_forked() { 0 } else { self.lock().reader_set.reader_count() }
+    }
+
     /// Returns whether any reader is attached.
     #[inline]
     pub fn has_readers(&self) -> bool {

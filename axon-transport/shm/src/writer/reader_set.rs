@@ -136,6 +136,12 @@ impl ReaderSet {
         gids
     }
 
+    /// Counts what [`readers`](Self::readers) lists, without an allocation.
+    pub(crate) fn reader_count(&self) -> usize {
+        let stands_for = |reader: &AttachedReader| reader.info.stands_for.as_ref().map(Vec::len);
+        self.readers.iter().map(|reader| stands_for(reader).unwrap_or(1)).sum()
+    }
+
     /// Adds a reader with the given lane. `resumed` is the position at which a returning reader continues.
     ///
     /// # Errors

@@ -108,14 +108,15 @@ pub(super) trait Taking: EndpointObject {
 }
 
 macro_rules! objects {
-    ($($object:ident: $matched:ident $(, $set:ident)?;)+) => {$(
+    ($($object:ident: $count:expr $(, $set:ident)?;)+) => {$(
         impl EndpointObject for $object {
             fn endpoint(&self) -> &Endpoint {
                 self.endpoint()
             }
 
             fn count(&self) -> usize {
-                self.$matched().len()
+                let count: fn(&Self) -> usize = $count;
+                count(self)
             }
         }
 
@@ -132,10 +133,10 @@ macro_rules! objects {
 }
 
 objects! {
-    Publisher: matched;
-    Subscription: matched, set_on_new_sample;
-    Server: clients, set_on_new_request;
-    Client: servers, set_on_new_response;
+    Publisher: Self::matched_count;
+    Subscription: Self::matched_count, set_on_new_sample;
+    Server: |server| server.clients().len(), set_on_new_request;
+    Client: |client| client.servers().len(), set_on_new_response;
 }
 
 /// Stores the GID and the profile of an endpoint.

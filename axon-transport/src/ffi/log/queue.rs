@@ -14,7 +14,7 @@ use std::{
 
 use axon_shm::internal::BlockedSignals;
 
-use super::{AXON_LOG_WARN, LogLine};
+use super::LogLine;
 
 /// The most lines that may be queued.
 const ROOM: usize = 256;
@@ -29,10 +29,50 @@ pub(super) struct WaitingLines {
 #[derive(Default)]
 struct QueueState {
     lines: VecDeque<LogLine>,
-    /// The number of lines that were dropped because the queue was full.
-    lost: u64,
+    dropped: DroppedLines,
     /// Whether the thread runs.
     runs: bool,
+}
+
+/// The lines that were dropped because the queue was full.
+#[derive(Default)]
+struct DroppedLines {
+    count: u64,
+    /// The highest severity among them.
+    severity: u32,
+}
+
+impl DroppedLines {
+    fn add(&mut self, severity: u32) {
+        self.count += 1;
+        self.severity = self.severity.max(severity);
+    }
+
+    /// Returns a line that says how many lines were dropped, if any were. It has the severity of the most severe one, so
+    /// that a program which shows warnings alone is not told of dropped debug lines.
+    fn take(&mut self) -> Option<LogLine> {
+        let Self { count, severity } = mem::take(self);
+        let text = format!("{count} log lines were dropped: more than {ROOM} waited");
+        (count > 0).then_some(LogLine { severity, part: module_path!(), text })
+    }
+}
+
+impl QueueState {
+    /// Adds a line. A full queue drops a line of the lowest severity, and of these the oldest.
+    fn add(&mut self, line: LogLine) {
+        if self.lines.len() < ROOM {
+            return self.lines.push_back(line);
+        }
+        let least = (0..self.lines.len()).min_by_key(|at| self.lines[*at].severity);
+        match least.filter(|at| self.lines[*at].severity < line.severity) {
+            Some(at) => {
+                let less = self.lines.remove(at);
+                self.lines.push_back(line);
+                less.iter().for_each(|less| self.dropped.add(less.severity));
+            }
+            None => self.dropped.add(line.severity),
+        }
+    }
 }
 
 thread_local! {
@@ -58,11 +98,7 @@ impl WaitingLines {
             // If the thread cannot be started, the next line tries again.
             state.runs = started.is_ok();
         }
-        if state.lines.len() < ROOM {
-            state.lines.push_back(line);
-        } else {
-            state.lost += 1;
-        }
+        state.add(line);
         drop(state);
         self.more.notify_one();
     }
@@ -71,17 +107,10 @@ impl WaitingLines {
         TELLS.set(self);
         let mut state = self.lock();
         loop {
-            let line = match (state.lines.pop_front(), state.lost) {
-                (Some(line), _) => line,
-                (None, 0) => {
-                    state = self.more.wait(state).unwrap_or_else(PoisonError::into_inner);
-                    continue;
-                }
-                (None, _) => {
-                    let lost = mem::take(&mut state.lost);
-                    let text = format!("{lost} more lines than could wait were said");
-                    LogLine { severity: AXON_LOG_WARN, part: module_path!(), text }
-                }
+            let next = state.lines.pop_front().or_else(|| state.dropped.take());
+            let Some(line) = next else {
+                state = self.more.wait(state).unwrap_or_else(PoisonError::into_inner);
+                continue;
             };
             drop(state);
             tell(line);
@@ -91,5 +120,41 @@ impl WaitingLines {
 
     fn lock(&self) -> MutexGuard<'_, QueueState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ffi::log::{AXON_LOG_DEBUG, AXON_LOG_ERROR, AXON_LOG_WARN};
+
+    fn line(severity: u32, number: usize) -> LogLine {
+        LogLine { severity, part: "", text: number.to_string() }
+    }
+
+    #[test]
+    fn dropped_debug_lines_are_reported_as_debug() {
+        let mut state = QueueState::default();
+        (0..ROOM + 44).for_each(|number| state.add(line(AXON_LOG_DEBUG, number)));
+        let dropped = state.dropped.take().unwrap();
+        assert_eq!(dropped.severity, AXON_LOG_DEBUG);
+        assert!(dropped.text.starts_with("44 log lines"), "{}", dropped.text);
+        assert!(state.dropped.take().is_none(), "once");
+    }
+
+    #[test]
+    fn full_queue_drops_debug_lines_for_warnings() {
+        let mut state = QueueState::default();
+        (0..ROOM).for_each(|number| state.add(line(AXON_LOG_DEBUG, number)));
+        (0..3).for_each(|number| state.add(line(AXON_LOG_WARN, number)));
+        let warnings = state.lines.iter().filter(|line| line.severity == AXON_LOG_WARN);
+        assert_eq!((state.lines.len(), warnings.count()), (ROOM, 3));
+        assert_eq!(state.lines.front().unwrap().text, "3", "the oldest were dropped");
+        assert_eq!(state.dropped.take().unwrap().severity, AXON_LOG_DEBUG);
+        // A queue of warnings drops the next warning, and takes an error.
+        (0..ROOM).for_each(|number| state.add(line(AXON_LOG_WARN, number)));
+        state.add(line(AXON_LOG_ERROR, 0));
+        assert_eq!(state.lines.back().unwrap().severity, AXON_LOG_ERROR);
+        assert_eq!(state.dropped.take().unwrap().severity, AXON_LOG_WARN);
     }
 }

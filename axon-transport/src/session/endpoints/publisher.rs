@@ -166,9 +166,14 @@ impl Publisher {
         self.writer.readers()
     }
 
+    /// Counts the readers that [`matched`](Self::matched) lists. Allocates nothing.
+    pub fn matched_count(&self) -> usize {
+        self.writer.reader_count()
+    }
+
     /// Waits until at least `count` readers receive from it. Returns whether they do.
     pub fn wait_matched(&self, count: usize, timeout: Duration) -> bool {
-        self.session.wait_changed(timeout, || self.matched().len() >= count)
+        self.session.wait_changed(timeout, || self.matched_count() >= count)
     }
 }
 

@@ -97,9 +97,14 @@ impl Subscription {
         self.inner.matched()
     }
 
+    /// Counts the publishers that [`matched`](Self::matched) lists. Allocates nothing.
+    pub fn matched_count(&self) -> usize {
+        if self.session.is_forked() { 0 } else { self.inner.matched_count() }
+    }
+
     /// Waits until it receives from at least `count` publishers. Returns whether it does.
     pub fn wait_matched(&self, count: usize, timeout: Duration) -> bool {
-        self.session.wait_changed(timeout, || self.matched().len() >= count)
+        self.session.wait_changed(timeout, || self.matched_count() >= count)
     }
 
     /// Returns the number of lost samples: overwritten before they were taken, missing in memory that is gone, or

@@ -284,6 +284,11 @@ impl SubscriptionInner {
         matched.map(|slot| slot.reader.writer()).collect()
     }
 
+    /// Counts the publishers that it receives from.
+    pub(in crate::session) fn matched_count(&self) -> usize {
+        self.lock().slots.iter().filter(|slot| slot.counts()).count()
+    }
+
     /// Returns the number of samples taken.
     pub(in crate::session) fn received(&self) -> u64 {
         self.lock().counts.received
