@@ -82,7 +82,8 @@ impl Config {
             .all(|one| *one != Some(LinkCompression::Never))
     }
 
-    /// Returns whether small RELIABLE samples of a topic, or the calls of a service, may cross both paths to a host.
+    /// Returns whether small RELIABLE samples of a topic, or small requests and responses of a service, may cross both paths
+    /// to a host.
     pub fn topic_redundancy(&self, name: &str) -> bool {
         topics::first(&self.topics, name).is_none_or(|rule| rule.redundant)
     }

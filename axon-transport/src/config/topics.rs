@@ -22,7 +22,7 @@ pub struct TopicRule {
     pub max_hz: Option<f64>,
     /// Compression of samples for other hosts. It applies only if `[link] compression` enables compression.
     pub compression: LinkCompression,
-    /// True if RELIABLE samples of at most 4 KiB also leave over the second path to a host. It applies only if `[link]
+    /// True if RELIABLE samples, requests and responses of at most 4 KiB also leave over the second path to a host. It applies only if `[link]
     /// paths` is 2.
     pub redundant: bool,
 }

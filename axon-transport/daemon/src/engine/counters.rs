@@ -50,8 +50,9 @@ impl Counters {
         self.bytes_in.set(self.bytes_in.get() + bytes as u64);
     }
 
-    /// Counts a sample that arrived, and did so over the second path first.
-    pub(crate) fn arrived_first(&self) {
+    /// Counts a sample that arrived over the second path first.
+    pub(crate) fn arrived_as_copy(&self, bytes: usize) {
+        self.arrived(bytes);
         self.copies_in.set(self.copies_in.get() + 1);
     }
 

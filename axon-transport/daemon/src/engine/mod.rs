@@ -262,9 +262,6 @@ impl Engine {
                     peer.send_graph(with.local, true);
                 });
                 self.reports.hurry(now);
-                if let Some(peer) = self.peers.get_mut(daemon) {
-                    peer.inbound.handle_elected(number);
-                }
                 // Streams that the peer opened before this host knew it: QUIC told of them once.
                 let opened = StreamEvent::Opened { dir: Dir::Uni };
                 self.handle_stream(now, number, daemon, opened);

@@ -74,6 +74,34 @@ impl StandIn {
         Ok(written)
     }
 
+    /// Writes the copy of a sample. Returns whether a reader gets it. If none does, nothing changes: the sample itself is
+    /// still to come.
+    pub(crate) fn try_write_copy(
+        &self,
+        client: &Gid,
+        meta: Meta,
+        payload: &[u8],
+        now: Duration,
+    ) -> bool {
+        let sequence = meta.sequence;
+        if self.rises && self.numbers.judge(sequence, now).is_err() {
+            return false;
+        }
+        if !matches!(self.ring.try_write(client, meta, payload), Ok(Written::Yes)) {
+            return false;
+        }
+        self.last.set(sequence);
+        if self.rises {
+            self.numbers.pass(sequence, now);
+        }
+        true
+    }
+
+    /// Returns whether nothing ever came from its publisher or client, before this stand-in was created either.
+    pub(crate) fn is_new(&self) -> bool {
+        self.numbers.last() == 0
+    }
+
     /// Wakes the sleeping subscriptions once for all written samples.
     pub(crate) fn announce(&self) {
         self.ring.announce();

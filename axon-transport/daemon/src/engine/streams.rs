@@ -20,6 +20,7 @@ impl Engine {
         let in_use = peer.link == number;
         match event {
             StreamEvent::Opened { dir: Dir::Uni } => {
+                peer.inbound.handle_elected(number);
                 while let Some(connection) = self.links.connection(number)
                     && let Some(stream) = connection.quic.streams().accept(Dir::Uni)
                 {

@@ -1,10 +1,13 @@
 //! Delivers copies of small samples, which the peer also sends over the link that stands by.
 //!
 //! A copy has the number of the sample before it in its flow. It is delivered once that sample is, so the order of a flow
-//! stays, and the sample itself then counts as delivered. A copy decides over nothing else: one that cannot be delivered
-//! at once, or soon, is dropped without a count, since its sample comes over the link in use.
+//! stays, and the sample itself then counts as delivered. Nothing else happens because of a copy: one that cannot be
+//! delivered now, or within a second, is dropped without a count, since its sample comes over the link in use.
 
-use std::{collections::HashMap, time::Duration};
+use std::{
+    collections::{HashMap, VecDeque},
+    time::Duration,
+};
 
 use axon_envelope::Kind;
 use axon_shm::ids::Gid;
@@ -32,8 +35,10 @@ pub(super) const AFTER: usize = 8;
 const MAX_LENGTH: u64 = (SMALL + MAX_OVERHEAD) as u64;
 /// Time for which a copy waits for the sample before it.
 const PATIENCE: Duration = Duration::from_secs(1);
-/// Maximum number of copies of a peer that wait.
-const MAX_WAITING: usize = 32;
+/// Maximum number of copies of a peer, and of one flow, that wait.
+const MAX_WAITING: (usize, usize) = (32, 8);
+/// Maximum number of flows whose delivered copies are remembered.
+const MAX_DELIVERED: usize = 64;
 
 /// A copy that was read.
 #[derive(Debug)]
@@ -43,41 +48,67 @@ pub(super) struct ReadCopy {
     pub(super) until: Duration,
 }
 
-/// The copies that wait for the sample before them, by flow.
+/// The copies of one peer.
 #[derive(Debug, Default)]
-pub(super) struct WaitingCopies {
-    flows: HashMap<(u32, Gid), Vec<StreamKey>>,
+pub(super) struct Copies {
+    /// The copies that wait for the sample before them, by flow.
+    waiting: HashMap<(u32, Gid), Vec<StreamKey>>,
     count: usize,
+    /// The newest copy that was delivered before its sample, by flow.
+    delivered: VecDeque<((u32, Gid), u64)>,
 }
 
-impl WaitingCopies {
+impl Copies {
+    /// Makes a copy wait. Returns whether it may.
     fn add(&mut self, flow: (u32, Gid), key: StreamKey) -> bool {
-        let has_room = self.count < MAX_WAITING;
+        let of_flow = self.waiting.get(&flow).map_or(0, Vec::len);
+        let has_room = self.count < MAX_WAITING.0 && of_flow < MAX_WAITING.1;
         if has_room {
-            self.flows.entry(flow).or_default().push(key);
+            self.waiting.entry(flow).or_default().push(key);
             self.count += 1;
         }
         has_room
     }
 
     fn remove(&mut self, flow: (u32, Gid), key: StreamKey) {
-        let Some(keys) = self.flows.get_mut(&flow) else { return };
+        let Some(keys) = self.waiting.get_mut(&flow) else { return };
         let before = keys.len();
         keys.retain(|other| *other != key);
         self.count -= before - keys.len();
         if keys.is_empty() {
-            self.flows.remove(&flow);
+            self.waiting.remove(&flow);
         }
     }
 
     /// Takes the copies of a flow that moved on.
     fn take(&mut self, flow: (u32, Gid)) -> Vec<StreamKey> {
-        if self.flows.is_empty() {
+        if self.waiting.is_empty() {
             return Vec::new();
         }
-        let keys = self.flows.remove(&flow).unwrap_or_default();
+        let keys = self.waiting.remove(&flow).unwrap_or_default();
         self.count -= keys.len();
         keys
+    }
+
+    /// Records that a copy was delivered. Its sample may come after its publisher, or client, is gone.
+    fn note_delivered(&mut self, flow: (u32, Gid), number: u64) {
+        match self.delivered.iter_mut().find(|(of, _)| *of == flow) {
+            Some((_, newest)) => *newest = number,
+            None => self.delivered.push_back((flow, number)),
+        }
+        if self.delivered.len() > MAX_DELIVERED {
+            self.delivered.pop_front();
+        }
+    }
+
+    /// Returns the number of the newest delivered copy of a flow.
+    pub(super) fn newest_delivered(&self, flow: (u32, Gid)) -> Option<u64> {
+        self.delivered.iter().find(|(of, _)| *of == flow).map(|(_, newest)| *newest)
+    }
+
+    /// Handles that the samples up to this number came over the link in use.
+    pub(super) fn handle_sample(&mut self, flow: (u32, Gid), number: u64) {
+        self.delivered.retain(|(of, newest)| *of != flow || *newest > number);
     }
 }
 
@@ -122,49 +153,53 @@ impl Inbound {
         let ReadCopy { message, until } = copy;
         let flow = (header.route, header.of);
         self.waiting.remove(&(until, key));
-        self.waiting_copies.remove(flow, key);
-        let Some(found) = self.routes.get(&header.route) else { return StepOutcome::Over };
+        self.copies.remove(flow, key);
+        let found = self.routes.get(&header.route).filter(|route| route.has_flow(&header.of));
+        let Some(found) = found else { return StepOutcome::Over };
         let Some(stand_in) = found.writers.get(&message.writer).cloned() else {
             return StepOutcome::Over;
         };
         let number = message.number;
-        let last = match route.kind {
-            Kind::Topic | Kind::Request => stand_in.last_sequence(),
-            Kind::Response => found.clients.get(&header.of).copied(),
+        let (last, is_new) = match route.kind {
+            Kind::Topic | Kind::Request => (stand_in.last_sequence(), stand_in.is_new()),
+            Kind::Response => {
+                let last = found.clients.get(&header.of).copied();
+                (last, last.is_none_or(|last| last == 0))
+            }
         };
-        let is_known = last >= Some(number) || stand_in.dropped(number) != EarlierFate::Unknown;
-        if is_known || !found.limit.is_none() {
+        let is_decided = |number| stand_in.dropped(number) != EarlierFate::Unknown;
+        if last >= Some(number) || is_decided(number) || !found.limit.is_none() {
             return StepOutcome::Over;
         }
         // Before the first sample of a flow, samples of an earlier link may be unread.
         let is_next = match stream.after {
-            0 => last.unwrap_or(0) == 0 && !self.turns.contains_key(&flow),
-            after => last >= Some(after) || stand_in.dropped(after) != EarlierFate::Unknown,
+            0 => is_new && !self.turns.contains_key(&flow),
+            after => last >= Some(after) || is_decided(after),
         };
+        if now >= until {
+            return StepOutcome::Over;
+        }
         if !is_next {
-            if now >= until || !self.waiting_copies.add(flow, key) {
+            if !self.copies.add(flow, key) {
                 return StepOutcome::Over;
             }
             self.waiting.insert((until, key));
             return wait(stream, StreamStep::Copy(ReadCopy { message, until }));
         }
         let OpenedMessage { meta, payload, .. } = message;
-        let since = &mut stream.short_since;
-        let Some(there) = self.write(&stand_in, header, meta, &payload, since, now) else {
+        if !stand_in.try_write_copy(&header.of, meta, &payload, now) {
             return StepOutcome::Over;
-        };
+        }
         if route.kind == Kind::Response
             && let Some(found) = self.routes.get_mut(&header.route)
         {
             found.clients.entry(header.of).and_modify(|last| *last = number);
         }
-        if there {
-            self.receipts.came(flow, number, payload.len(), now);
-            self.counters.arrived_first();
-        } else {
-            self.receipts.dropped(flow, number, now);
-        }
-        self.handle_delivered(flow);
+        self.counters.arrived_as_copy(payload.len());
+        self.announce_later(&stand_in);
+        self.receipts.came(flow, number, payload.len(), now);
+        self.copies.note_delivered(flow, number);
+        self.handle_decided(flow);
         StepOutcome::Over
     }
 
@@ -173,9 +208,9 @@ impl Inbound {
         StreamStep::Copy(ReadCopy { message, until: now + PATIENCE })
     }
 
-    /// Continues the copies that waited for a sample of this flow.
-    pub(super) fn handle_delivered(&mut self, flow: (u32, Gid)) {
-        for key in self.waiting_copies.take(flow) {
+    /// Continues the copies that waited for a sample of this flow, which was delivered or dropped.
+    pub(super) fn handle_decided(&mut self, flow: (u32, Gid)) {
+        for key in self.copies.take(flow) {
             self.make_ready(key);
         }
     }
@@ -184,7 +219,7 @@ impl Inbound {
     pub(super) fn forget_copy(&mut self, key: StreamKey, stream: &IncomingStream) {
         if let (StreamStep::Copy(copy), Some((header, _))) = (&stream.step, stream.header) {
             self.waiting.remove(&(copy.until, key));
-            self.waiting_copies.remove((header.route, header.of), key);
+            self.copies.remove((header.route, header.of), key);
         }
     }
 }

@@ -37,8 +37,13 @@ impl Inbound {
                 return wait(stream, StreamStep::Writer(message, until));
             }
             self.waiting.remove(&(until, key));
-            self.counters.lost(&self.topic(header.route), "no_route", 1);
-            if header.acknowledged {
+            // Its copy was delivered while its publisher was still there.
+            let is_known =
+                self.copies.newest_delivered((header.route, header.of)) >= Some(message.number);
+            if !is_known {
+                self.counters.lost(&self.topic(header.route), "no_route", 1);
+            }
+            if !is_known && header.acknowledged {
                 // The sender would keep it for as long as the link stands.
                 self.receipts.dropped((header.route, header.of), message.number, now);
             }
@@ -62,6 +67,7 @@ impl Inbound {
         }
         if acknowledged && (before == EarlierFate::Passed || last >= Some(sequence)) {
             self.receipts.came(flow, sequence, length, now);
+            self.copies.handle_sample(flow, sequence);
             self.release(stream);
             return StepOutcome::Go;
         }
@@ -105,7 +111,8 @@ impl Inbound {
         }
         if acknowledged {
             self.receipts.came(flow, sequence, length, now);
-            self.handle_delivered(flow);
+            self.copies.handle_sample(flow, sequence);
+            self.handle_decided(flow);
         }
         self.release(stream);
         if header.reliable { StepOutcome::Go } else { StepOutcome::Over }
@@ -123,6 +130,7 @@ impl Inbound {
         let Some((header, _)) = stream.header else { return StepOutcome::Over };
         if acknowledged {
             self.receipts.dropped((header.route, header.of), sequence, now);
+            self.handle_decided((header.route, header.of));
         }
         self.release(stream);
         if header.reliable { StepOutcome::Go } else { StepOutcome::Over }
@@ -150,12 +158,7 @@ impl Inbound {
         match written {
             Ok(Written::Yes) => {
                 self.counters.arrived(payload.len());
-                let before = self.written.as_ref();
-                if before.is_none_or(|before| !Rc::ptr_eq(before, stand_in))
-                    && let Some(before) = self.written.replace(Rc::clone(stand_in))
-                {
-                    before.announce();
-                }
+                self.announce_later(stand_in);
                 Some(true)
             }
             Ok(Written::Nobody) => {

@@ -30,7 +30,7 @@ use axon_transport::internal::log_limit::LogLimit;
 use quinn_proto::{StreamId, VarInt};
 
 use self::{
-    copies::WaitingCopies,
+    copies::Copies,
     incoming::{IncomingStream, StreamStep},
     limited::RateLimitedStreams,
     receipts::Receipts,
@@ -120,7 +120,9 @@ pub(crate) struct Inbound {
     /// Streams that wait for memory.
     without_room: StreamQueue,
     limited: RateLimitedStreams,
-    waiting_copies: WaitingCopies,
+    copies: Copies,
+    /// Streams whose link is not elected, and that are no copies.
+    parked: BTreeSet<StreamKey>,
     /// Memory for one short message if the identity has none left. Complete messages are then read one after
     /// the other.
     spare: Rc<Meter>,
@@ -160,7 +162,8 @@ impl Inbound {
             full: HashSet::new(),
             without_room: StreamQueue::default(),
             limited: RateLimitedStreams::default(),
-            waiting_copies: WaitingCopies::default(),
+            copies: Copies::default(),
+            parked: BTreeSet::new(),
             spare: Meter::new(LONG_MESSAGE_BYTES),
             full_retry: None,
             exceeded: None,
@@ -193,14 +196,12 @@ impl Inbound {
         self.make_ready((link, stream));
     }
 
-    /// Continues the streams of a link that was elected: it may carry more than copies now.
+    /// Continues the streams of a link that waited for its election.
     pub(crate) fn handle_elected(&mut self, link: u64) {
-        let waits = |stream: &IncomingStream| matches!(stream.step, StreamStep::Election);
-        let streams = self.streams.iter().filter(|(key, stream)| key.0 == link && waits(stream));
-        let mut keys: Vec<_> = streams.map(|(key, _)| *key).collect();
         // In the order in which the peer opened them.
-        keys.sort_unstable();
-        keys.into_iter().for_each(|key| self.make_ready(key));
+        for key in self.parked.extract_if(.., |key| key.0 == link).collect::<Vec<_>>() {
+            self.make_ready(key);
+        }
     }
 
     fn make_ready(&mut self, key: StreamKey) {
@@ -317,6 +318,7 @@ impl Inbound {
         if let StreamStep::Turn(until) | StreamStep::Writer(_, until) = stream.step {
             self.waiting.remove(&(until, key));
         }
+        self.parked.remove(&key);
         self.forget_copy(key, &stream);
     }
 
@@ -347,6 +349,16 @@ impl Inbound {
     fn topic(&self, number: u32) -> Arc<str> {
         let route = self.routes.get(&number);
         route.map_or_else(|| "(a route that ended)".into(), |route| Arc::clone(&route.topic))
+    }
+
+    /// Wakes the subscriptions of a stand-in at the end of the turn, once for all that was written.
+    fn announce_later(&mut self, stand_in: &Rc<StandIn>) {
+        let before = self.written.as_ref();
+        if before.is_none_or(|before| !Rc::ptr_eq(before, stand_in))
+            && let Some(before) = self.written.replace(Rc::clone(stand_in))
+        {
+            before.announce();
+        }
     }
 
     fn lost(&self, cause: &'static str, header: StreamHeader, why: &str, now: Duration) {

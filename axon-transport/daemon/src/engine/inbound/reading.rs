@@ -121,6 +121,7 @@ impl Inbound {
                     return Ok(StepOutcome::Go);
                 }
                 if stream.copies_alone {
+                    self.parked.insert(key);
                     return Ok(wait(stream, StreamStep::Election));
                 }
                 let turns = self.turns.entry((header.route, header.of)).or_default();
@@ -229,7 +230,10 @@ impl Inbound {
                 return wait(stream, StreamStep::Turn(until));
             }
             self.waiting.remove(&(until, key));
-            self.counters.lost(&self.topic(header.route), "no_route", 1);
+            // The copies of its last samples were delivered while its publisher was still there.
+            if self.copies.newest_delivered((header.route, header.of)).is_none() {
+                self.counters.lost(&self.topic(header.route), "no_route", 1);
+            }
             let _ = quic.recv_stream(key.1).stop(NO_ROUTE);
             return StepOutcome::Over;
         };
@@ -362,7 +366,7 @@ impl Inbound {
     }
 
     pub(super) fn end_turn(&mut self, key: StreamKey, stream: &IncomingStream) {
-        let Some((header, _)) = stream.header else { return };
+        let Some((header, _)) = stream.header.filter(|(header, _)| !header.copy) else { return };
         let flow = (header.route, header.of);
         let Some(turns) = self.turns.get_mut(&flow) else { return };
         turns.retain(|other| *other != key);
@@ -370,6 +374,7 @@ impl Inbound {
             Some(next) => self.make_ready(next),
             None => {
                 self.turns.remove(&flow);
+                self.handle_decided(flow);
             }
         }
     }

@@ -74,8 +74,9 @@ impl Inbound {
         let flow = (header.route, header.of);
         if let Some(newest) = came.newest {
             self.receipts.came_all(flow, newest, came.samples, came.bytes, now);
-            self.handle_delivered(flow);
+            self.copies.handle_sample(flow, newest);
         }
+        self.handle_decided(flow);
         match next? {
             None => Ok(None),
             Some(StreamStep::Ring(message)) => {

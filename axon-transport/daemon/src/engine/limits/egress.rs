@@ -72,13 +72,13 @@ pub(crate) struct Egress {
 
 impl Egress {
     /// Replaces the limits on what is sent to the peer.
-    pub(super) fn set_peer(&mut self, caps: Vec<Rc<EgressCap>>) {
+    pub(crate) fn set_peer(&mut self, caps: Vec<Rc<EgressCap>>) {
         self.peer = caps;
     }
 
-    /// Replaces the limits on what is sent to the peer by those of another connection to it.
-    pub(crate) fn share_peer(&mut self, other: &Self) {
-        self.peer.clone_from(&other.peer);
+    /// Returns the limits on what is sent to the peer.
+    pub(crate) fn peer(&self) -> Vec<Rc<EgressCap>> {
+        self.peer.clone()
     }
 
     /// Replaces the limits on what leaves by the interface with this address.

@@ -55,11 +55,13 @@ impl AnswerWatch {
         *self = Self { acknowledged, sent: asked + pings, since: None };
     }
 
-    /// Begins anew if the peer answered since.
-    pub(in crate::engine) fn handle_exchange(&mut self, exchange: Exchange) {
-        if exchange.acknowledged != self.acknowledged {
+    /// Begins anew if the peer answered since. Returns whether it did.
+    pub(in crate::engine) fn handle_exchange(&mut self, exchange: Exchange) -> bool {
+        let is_answer = exchange.acknowledged != self.acknowledged;
+        if is_answer {
             self.restart(exchange);
         }
+        is_answer
     }
 
     /// Records that a packet left.
@@ -99,9 +101,9 @@ mod tests {
         watch.handle_sent(|| exchange(3, 5, 1), NOW * 2);
         watch.handle_sent(|| exchange(3, 9, 1), NOW * 3);
         assert_eq!(watch.since(), Some(NOW * 2), "the first one");
-        watch.handle_exchange(exchange(3, 9, 1));
+        assert!(!watch.handle_exchange(exchange(3, 9, 1)));
         assert_eq!(watch.since(), Some(NOW * 2), "nothing was acknowledged");
-        watch.handle_exchange(exchange(4, 9, 1));
+        assert!(watch.handle_exchange(exchange(4, 9, 1)));
         assert_eq!(watch.since(), None);
     }
 

@@ -12,7 +12,8 @@ use quinn_proto::{Connection, Dir, StreamId, VarInt};
 
 use crate::{engine::sample::stream_header::StreamHeader, link::CloseCode};
 
-/// Maximum number of copies in flight. A peer reads fewer streams at a time before a link is elected.
+/// Maximum number of copies in flight. Before a link is elected its peer allows 128 streams at a time, which are also for
+/// those that the election precedes.
 const MOST: usize = 96;
 /// Maximum number of copies in flight of one flow, so that a fast flow leaves some to the others.
 const MOST_OF_FLOW: usize = 32;
@@ -23,9 +24,9 @@ const ROUND_TRIPS: u32 = 3;
 /// answered shows that the path works again.
 const FIRST_PINGS: (Duration, Duration) = (Duration::from_secs(10), Duration::from_millis(100));
 const PING: Duration = Duration::from_secs(1);
-/// Time after which a copy is given up. Its sample has arrived over the link in use, or the link that stands by has
-/// taken over and sent the sample itself.
-const LIFE: Duration = Duration::from_secs(1);
+/// Time, and number of round trips, after which a copy is given up. Its sample has arrived over the link in use, or the
+/// peer lacks the sample before it.
+const LIFE: (Duration, u32) = (Duration::from_secs(1), 4);
 
 /// A copy that is to leave.
 #[derive(Debug)]
@@ -69,6 +70,8 @@ pub(in crate::engine) struct CopyStreams {
     bytes: usize,
     /// Number of copies that left.
     sent: u64,
+    /// True if a copy left since the peer's latest answer.
+    is_asking: bool,
     ping_at: Option<Duration>,
 }
 
@@ -81,9 +84,8 @@ impl CopyStreams {
         since: Option<Duration>,
         now: Duration,
     ) -> usize {
-        // A PING, and the first packets after a take-over, always fit into the congestion window.
-        let fits = (self.bytes as u64) < quic.congestion_state().window() / 2;
-        if is_silent(since, quic.rtt(), now) || !fits { 0 } else { MOST - self.in_flight.len() }
+        let is_full = !self.in_flight.is_empty() && self.bytes >= most_bytes(quic);
+        if is_full || is_silent(since, quic.rtt(), now) { 0 } else { MOST - self.in_flight.len() }
     }
 
     /// Sends a copy in a stream of its own.
@@ -95,15 +97,16 @@ impl CopyStreams {
     ) {
         let of = (copy.header.route, copy.header.of);
         let of_flow = self.in_flight.iter().filter(|sent| sent.of == of).count();
-        if self.in_flight.len() >= MOST || of_flow >= MOST_OF_FLOW {
-            return;
-        }
-        let Some(stream) = quic.streams().open(Dir::Uni) else { return };
         let mut start = copy.header.encode().to_vec();
         start.extend_from_slice(&copy.after.to_be_bytes());
         let mut chunks = vec![Bytes::from(start)];
         chunks.append(&mut copy.frames);
         let bytes = chunks.iter().map(Bytes::len).sum();
+        let fits = self.in_flight.is_empty() || self.bytes + bytes <= most_bytes(quic);
+        if !fits || self.in_flight.len() >= MOST || of_flow >= MOST_OF_FLOW {
+            return;
+        }
+        let Some(stream) = quic.streams().open(Dir::Uni) else { return };
         let written = quic.send_stream(stream).write_chunks(&mut chunks).map(|taken| taken.bytes);
         if written != Ok(bytes) {
             reset(quic, stream);
@@ -111,7 +114,18 @@ impl CopyStreams {
         }
         let _ = quic.send_stream(stream).finish();
         self.in_flight.push(SentCopy { stream, of, sent_at: now, bytes });
-        (self.bytes, self.sent) = (self.bytes + bytes, self.sent + 1);
+        (self.bytes, self.sent, self.is_asking) = (self.bytes + bytes, self.sent + 1, true);
+    }
+
+    /// Handles that the peer answered over this connection.
+    pub(in crate::engine) fn handle_answer(&mut self) {
+        (self.is_asking, self.ping_at) = (false, None);
+    }
+
+    /// Gives up all copies, because the connection is put in use and carries the samples themselves.
+    pub(in crate::engine) fn give_up(&mut self, quic: &mut Connection) {
+        self.in_flight.drain(..).for_each(|copy| reset(quic, copy.stream));
+        (self.bytes, self.is_asking) = (0, false);
     }
 
     /// Handles that a stream is over: the peer acknowledged all of it. Returns whether it was
@@ -148,7 +162,8 @@ impl CopyStreams {
         since: Option<Duration>,
         round_trip: Duration,
     ) -> Option<Duration> {
-        let over = self.in_flight.first().map(|oldest| oldest.sent_at + LIFE);
+        let over = self.in_flight.first().map(|oldest| oldest.sent_at + life(round_trip));
+        let since = since.filter(|_| self.is_asking);
         let silent = since.map(|since| since + silent_after(round_trip));
         let ping = silent.map(|silent| self.ping_at.map_or(silent, |ping| ping.max(silent)));
         [over, ping].into_iter().flatten().min()
@@ -161,14 +176,16 @@ impl CopyStreams {
         since: Option<Duration>,
         now: Duration,
     ) -> bool {
+        let life = life(quic.rtt());
         while let Some(oldest) = self.in_flight.first()
-            && oldest.sent_at + LIFE <= now
+            && oldest.sent_at + life <= now
         {
             reset(quic, oldest.stream);
             self.bytes -= oldest.bytes;
             self.in_flight.remove(0);
         }
-        let Some(since) = since.filter(|_| is_silent(since, quic.rtt(), now)) else { return false };
+        let is_due = self.is_asking && is_silent(since, quic.rtt(), now);
+        let Some(since) = since.filter(|_| is_due) else { return false };
         if self.ping_at.is_some_and(|ping| now < ping) {
             return false;
         }
@@ -176,6 +193,16 @@ impl CopyStreams {
         self.ping_at = Some(now + if is_first { FIRST_PINGS.1 } else { PING });
         true
     }
+}
+
+/// Returns the bytes of copies that may be in flight. A PING, and the first packets after a take-over, then fit into the
+/// congestion window.
+fn most_bytes(quic: &Connection) -> usize {
+    usize::try_from(quic.congestion_state().window() / 2).unwrap_or(usize::MAX)
+}
+
+fn life(round_trip: Duration) -> Duration {
+    LIFE.0.max(LIFE.1 * round_trip)
 }
 
 fn silent_after(round_trip: Duration) -> Duration {

@@ -40,11 +40,11 @@ impl Links {
             return;
         };
         let in_use = self.table.current(daemon).and_then(|number| self.connections.get(number));
-        let egress = in_use.map(|connection| connection.egress.clone());
+        let caps = in_use.map(|connection| connection.egress.peer());
         let Some(standby) = self.connections.get_mut(number) else { return };
         // The limits on what leaves for the peer hold for both links together.
-        if let Some(egress) = egress {
-            standby.egress.share_peer(&egress);
+        if let Some(caps) = caps {
+            standby.egress.set_peer(caps);
         }
         for copy in &mut copies {
             standby.copies.send(&mut standby.quic, copy, now);

@@ -105,7 +105,8 @@ impl Failover {
     }
 }
 
-fn silent_after(round_trip: Duration) -> Duration {
+/// Returns the time without an acknowledgement after which a path counts as cut.
+pub(super) fn silent_after(round_trip: Duration) -> Duration {
     SILENT.max(ROUND_TRIPS * round_trip)
 }
 

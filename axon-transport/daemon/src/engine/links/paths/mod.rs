@@ -250,10 +250,13 @@ impl Links {
         let current = self.table.current_peer(daemon).and_then(|current| current.elected);
         let is_newest = current.is_none_or(|current| current.election < elected.election);
         if stands_by && is_newest && self.claim(daemon, &who, proven, now).is_ok() {
-            self.give_up_silent(daemon);
+            self.give_up_silent(daemon, now);
         }
         if stands_by {
             self.table.take_standby(daemon);
+            if let Some(connection) = self.connections.get_mut(number) {
+                connection.copies.give_up(&mut connection.quic);
+            }
             if let Some(paths) = self.paths.all.get_mut(&daemon) {
                 paths.search.handle_lost(now);
             }
@@ -272,15 +275,21 @@ impl Links {
         self.handle_elected(number, elected, now);
     }
 
-    /// Takes the link in use for silent: nothing is expected over it when another one takes over.
-    fn give_up_silent(&mut self, daemon: DaemonId) {
+    /// Takes the link in use for silent if it does not answer: nothing is expected over it when another one takes over. A
+    /// link that answers delivers what is in flight.
+    fn give_up_silent(&mut self, daemon: DaemonId, now: Duration) {
         let Some(number) = self.table.current(daemon) else { return };
         let (Some(connection), Some(peer)) =
             (self.connections.get(number), self.table.peer_mut(number))
         else {
             return;
         };
-        peer.silence.handle_failover(Traffic::from(&connection.quic.stats()));
+        let since = connection.watch.as_ref().and_then(AnswerWatch::since);
+        if since
+            .is_some_and(|since| since + failover::silent_after(connection.quic.rtt()) / 2 <= now)
+        {
+            peer.silence.handle_failover(Traffic::from(&connection.quic.stats()));
+        }
     }
 
     fn exchange(&self, number: u64) -> Exchange {
@@ -298,9 +307,11 @@ impl Links {
         if in_use {
             paths.failover.handle_exchange(exchange);
         }
-        let connection = self.connections.get_mut(number);
-        if let Some(watch) = connection.and_then(|connection| connection.watch.as_mut()) {
-            watch.handle_exchange(exchange);
+        if let Some(connection) = self.connections.get_mut(number)
+            && let Some(watch) = &mut connection.watch
+            && watch.handle_exchange(exchange)
+        {
+            connection.copies.handle_answer();
         }
     }
 

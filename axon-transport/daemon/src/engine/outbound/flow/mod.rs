@@ -4,6 +4,7 @@
 mod batch;
 mod best_effort;
 mod compressing;
+mod copying;
 mod credit;
 mod info;
 mod reliable;

@@ -11,6 +11,7 @@ use quinn_proto::{Connection, Dir, StreamId, VarInt, WriteError};
 use super::{
     FlowPause,
     batch::{Batch, Sealed},
+    copying::CopyRule,
     credit::{ALWAYS, CreditShare},
     info::FlowInfo,
 };
@@ -31,8 +32,6 @@ use crate::{
 pub(super) const TOGETHER: usize = 64 << 10;
 /// Maximum length of a sample that is copied into one piece with its neighbours.
 const COPIED: usize = 4096;
-/// Maximum number of samples that wait together and are copied for the second path. More are bulk.
-const LONE: u64 = 8;
 /// Bytes that count as progress of a long sample, if QUIC took them for the first time.
 const PART: u64 = 256 << 10;
 /// Time after which an idle stream is finished.
@@ -58,6 +57,7 @@ pub(super) struct ReliableStream {
     /// Bytes that QUIC took for the first time; `sent_progress` has the position.
     new_bytes: u64,
     sent_progress: SentProgress,
+    copying: CopyRule,
 }
 
 impl ReliableStream {
@@ -73,6 +73,7 @@ impl ReliableStream {
             active_at: Duration::ZERO,
             new_bytes: 0,
             sent_progress: SentProgress::default(),
+            copying: CopyRule::default(),
         }
     }
 
@@ -263,6 +264,7 @@ impl ReliableStream {
             // A sample takes more in the queue than its header does in the batch.
             frames.reserve(queue.waiting_bytes().min(TOGETHER + COPIED));
         }
+        let is_copied = carrier.copies.has_room() && self.copying.takes(queue.waiting(), now);
         while bytes < TOGETHER {
             if samples > 0 && !self.has_credit(info, queue, carrier) {
                 break;
@@ -273,7 +275,7 @@ impl ReliableStream {
             if !queue.peek().is_some_and(is_next) {
                 break;
             }
-            let (after, is_lone) = (queue.newest_sent(), queue.waiting() <= LONE);
+            let after = queue.newest_sent();
             let Some(sample) = queue.send() else { break };
             let (sequence, length) = (sample.info.sequence, sample.length());
             let payload = sample.payload.len();
@@ -286,8 +288,9 @@ impl ReliableStream {
                 }
                 break;
             }
+            // A sample that is sent again follows others that were sent again.
             let is_first_time = after < sequence;
-            if is_lone && is_first_time && carrier.copies.has_room() && info.is_copied(sample) {
+            if is_copied && is_first_time && carrier.copies.has_room() && info.is_copied(sample) {
                 carrier.copy(info.copy_header(), info.route, sample, after, now);
             }
             end = frames.len() as u64;
