@@ -25,9 +25,9 @@ pub enum ShmError {
     /// A system call failed.
     #[error("shared memory: {what}: {source}{}", OwnLimit(source))]
     System {
-        /// What was being done.
+        /// The purpose of the call.
         what: &'static str,
-        /// What the system answered.
+        /// The error that the system returned.
         source: io::Error,
     },
     /// There is not enough memory to back a new segment.
@@ -41,35 +41,35 @@ pub enum ShmError {
         /// Bytes available to this process when it asked.
         available: u64,
     },
-    /// Rings that share a bound on their memory have as much as they may.
+    /// Rings that share a memory budget have used it up.
     #[error(
         "shared memory: {needed} bytes needed, {available} left of the {most} that the rings of one peer may take"
     )]
     MemoryBudget {
         /// Bytes that were needed.
         needed: u64,
-        /// Bytes that the ring could have had.
+        /// Bytes that the ring could still have taken.
         available: u64,
-        /// The bound that the rings share.
+        /// The budget in bytes.
         most: u64,
     },
-    /// A descriptor from another process is not a segment as it must be.
+    /// A descriptor from another process is not a valid segment.
     #[error("shared memory of another process refused: {what}")]
     Refused {
-        /// What was wrong with it.
+        /// The defect.
         what: &'static str,
     },
-    /// Other processes' memory takes as much of this one's address space as it may.
+    /// The memory of other processes has used up its share of this process's address space.
     #[error(
         "shared memory not mapped: that of {whose} takes up to {maps} maps and {bytes} bytes of \
          this process's address space"
     )]
     AddressSpace {
-        /// Whose memory that is.
+        /// The owner of the limit: one other process, or all of them together.
         whose: &'static str,
-        /// The most maps.
+        /// The largest number of maps.
         maps: u64,
-        /// The most bytes.
+        /// The largest number of bytes.
         bytes: u64,
     },
     /// The samples would need more address space than a publisher may take.
@@ -85,31 +85,32 @@ pub enum ShmError {
         /// The history that was asked for, in bytes.
         budget: u64,
     },
-    /// The session reads as many rings as a session may.
+    /// The session already reads the maximum number of rings.
     #[error("session {session} has no free reader lane left (of {lanes}): close subscriptions")]
     NoLane {
         /// The session.
         session: SessionId,
-        /// How many lanes it has.
+        /// The number of its lanes.
         lanes: u32,
     },
-    /// The servers of the session have as many clients as they may.
+    /// The servers of the session already have the maximum number of clients.
     #[error(
         "the servers of a relayed session may have {0} clients: share memory, or use more processes"
     )]
     TooManyClients(usize),
-    /// The session has given out all numbers for segments of its memory.
+    /// The session has used all segment numbers.
     #[error("session {0} has opened as many segments as a session may: open another session")]
     NoNumber(SessionId),
     /// A second waiter asked to lead the session's waits.
     #[error("session {0} already has an external leader of its waits")]
     AlreadyLed(SessionId),
-    /// The process forked: what was created before belongs to the parent.
+    /// The process forked: objects that were created before belong to the parent.
     #[error("used after fork: a child process must open a session of its own")]
     Forked,
 }
 
-/// What to do where the system says that this process has too many descriptors open; nothing otherwise.
+/// Displays the remedy if the error says that this process has too many open descriptors (EMFILE). Displays nothing for
+/// any other error.
 #[derive(Debug)]
 pub struct OwnLimit<'a>(pub &'a io::Error);
 
@@ -150,15 +151,15 @@ impl ShmError {
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum PublishError {
-    /// The sample is larger than the ring was made for.
+    /// The sample is larger than the ring's limit.
     #[error("sample of {len} bytes; the largest is {max} (AXON_MAX_MESSAGE_MB)")]
     TooLarge {
         /// The sample's length in bytes.
         len: u64,
-        /// The largest, in bytes.
+        /// The limit in bytes.
         max: u64,
     },
-    /// A KEEP_ALL reader left no room for the whole time that a publish waits.
+    /// A KEEP_ALL reader left no room during the whole time that a publish waits.
     #[error("reader {reader} takes samples too slowly: KEEP_ALL history is full")]
     Blocked {
         /// The reader that lags.
@@ -175,45 +176,45 @@ pub enum PublishError {
         needed: u64,
         /// Bytes available to this process when it asked.
         available: u64,
-        /// A reader that pins samples whose memory would suffice.
+        /// A reader whose pinned samples hold enough memory for this one.
         keeper: Option<PinHolder>,
     },
-    /// Rings that share a bound on their memory have as much as they may.
+    /// Rings that share a memory budget have used it up.
     #[error(
         "{needed} bytes more needed for the sample, {available} left of the {most} that the rings of one peer may take"
     )]
     MemoryBudget {
         /// Bytes that were needed.
         needed: u64,
-        /// Bytes that the ring could have had.
+        /// Bytes that the ring could still have taken.
         available: u64,
-        /// The bound that the rings share.
+        /// The budget in bytes.
         most: u64,
     },
     /// The system refused a segment for large samples.
     #[error("no segment for the sample: {reason}")]
     Segment {
-        /// What the system refused, and why.
+        /// The refused operation and the reason.
         reason: String,
     },
     /// Loans that were neither published nor dropped hold the ring's memory.
     #[error("{loans} loans hold the ring's memory: publish or drop them first")]
     Loaned {
-        /// How many loans are out.
+        /// The number of outstanding loans.
         loans: u32,
     },
-    /// Samples that a reader has not dropped hold the ring's memory.
+    /// Samples that readers have not dropped hold the ring's memory.
     #[error("the ring's memory is full: {keeper}; drop samples in that reader or close it")]
     Pinned {
         /// A reader that pins samples.
         keeper: PinHolder,
     },
-    /// The number that a publisher elsewhere gave its sample cannot be.
+    /// The caller's sequence number does not fit the numbers of the samples before.
     #[error("sequence number {sequence} after {last}: so many samples cannot have been lost")]
     Sequence {
         /// The sample's number.
         sequence: u64,
-        /// That of the last sample before it.
+        /// The number of the sample before it.
         last: u64,
     },
     /// A loan was published before all of it was written.
@@ -221,7 +222,7 @@ pub enum PublishError {
     Incomplete {
         /// The loan's length in bytes.
         len: u64,
-        /// Bytes that were written.
+        /// The number of bytes that were written.
         written: u64,
     },
     /// The process forked: the publisher belongs to the parent.
@@ -286,12 +287,13 @@ fn held_by(keeper: Option<&PinHolder>) -> String {
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum TakeError {
-    /// The publisher's process wrote what no publisher writes. The ring is not read again.
+    /// The publisher's process broke the protocol: it wrote something that no publisher writes. The ring is not read
+    /// again.
     #[error("ring of publisher {writer} is corrupt ({what}); detached from it")]
     Corrupt {
         /// The publisher.
         writer: Gid,
-        /// What was wrong.
+        /// The defect.
         what: &'static str,
     },
     /// A sample is longer than the subscription expects. It was passed over and counts as lost.
@@ -304,7 +306,7 @@ pub enum TakeError {
         writer: Gid,
         /// The sample's length in bytes.
         len: u64,
-        /// The largest that is taken, in bytes.
+        /// The limit in bytes.
         max: u64,
     },
     /// The sample does not fit in this process's memory.

@@ -57,20 +57,22 @@ macro_rules! id {
 }
 
 id! {
-    /// A daemon: random, new at each of its starts. Addresses are candidates, never identity.
+    /// The id of a daemon: random, new at each start. A daemon is identified by it, never by an
+    /// address.
     DaemonId
 }
 id! {
-    /// A session of a process with its daemon: random, new for each session.
+    /// The id of a process's session with its daemon: random, new for each session.
     SessionId
 }
 id! {
-    /// An endpoint: the first 12 bytes of its session's id, then its number in that session.
+    /// The id of an endpoint: the first 12 bytes of its session's id, then its number in that
+    /// session.
     Gid
 }
 
 impl Gid {
-    /// The GID of entity `number` of `session`.
+    /// Returns the GID of entity `number` of `session`.
     #[inline]
     pub fn new(session: SessionId, number: u32) -> Self {
         let mut gid = session.0;
@@ -78,13 +80,13 @@ impl Gid {
         Self(gid)
     }
 
-    /// Whether it and `other` are of the same session.
+    /// Returns whether this endpoint and `other` belong to the same session.
     #[inline]
     pub fn is_of_session_of(&self, other: &Self) -> bool {
         self.0[..12] == other.0[..12]
     }
 
-    /// Whether it is one that `session` may give to an endpoint of its own.
+    /// Returns whether `session` may give this GID to one of its endpoints.
     #[inline]
     pub fn is_of(&self, session: &SessionId) -> bool {
         self.0[..12] == session.0[..12]

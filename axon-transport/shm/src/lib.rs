@@ -45,8 +45,8 @@ pub use ring::types::{Meta, Published};
 pub use session::leader::ExternalLeader;
 pub use writer::loan::Loan;
 
-/// What the other crates of AXON use of this one. It is not part of its interface, and changes with any
-/// release.
+/// The items that other crates of AXON use. They are not part of this crate's public interface: any release may change
+/// them.
 #[doc(hidden)]
 pub mod internal {
     pub use crate::{
@@ -89,12 +89,12 @@ pub mod internal {
         writer::{CarrierState, MAX_GAP, Writer},
     };
 
-    /// What rings and lanes say of themselves.
+    /// Counters that rings and lanes keep about themselves.
     pub mod inspect {
         pub use crate::ring::inspect::{LaneCounts, RingCounts, committed, timestamp};
     }
 
-    /// Descriptors that go from process to process.
+    /// Descriptors that one process passes to another.
     pub mod descriptors {
         pub use crate::os::descriptors::{
             FEW_DESCRIPTORS, PassedFd, SocketPacket, carries_descriptors, close_queue_is_full,

@@ -16,20 +16,20 @@ use std::sync::atomic::{AtomicU32, AtomicU64, fence};
 pub(crate) trait Word {
     fn load(&self, order: Ordering) -> u64;
     fn store(&self, value: u64, order: Ordering);
-    /// Stores the larger of the two and returns what was there. For words private to a process.
+    /// Stores the larger of both values and returns the previous value. For words private to a process.
     fn fetch_max(&self, value: u64, order: Ordering) -> u64;
-    /// Adds to what is there and returns it. For words that one process alone writes.
+    /// Adds `value` and returns the previous value. For words that only one process writes.
     fn fetch_add(&self, value: u64, order: Ordering) -> u64;
     fn fence(order: Ordering);
 }
 
-/// A 32-bit atomic word that says who holds a lock of this process.
+/// A 32-bit atomic word that names the holder of a lock within this process.
 pub(crate) trait LockWord {
-    /// Stores `to` if `from` is there; whether it was.
+    /// Stores `to` if the word is `from`. Returns whether it did.
     fn swap_if(&self, from: u32, to: u32, order: Ordering) -> bool;
 }
 
-/// A place where the order of memory accesses matters. All others are relaxed.
+/// A memory access whose ordering matters. All other accesses are relaxed.
 ///
 /// | site | pairs with | so that |
 /// | --- | --- | --- |
@@ -38,14 +38,14 @@ pub(crate) trait LockWord {
 /// | `TailStore` | `TailLoad` | a reader never sees a tail above the head that it loads next |
 /// | `ReuseFence` | `StandsFence` | a reader that saw a reuse sees the tail or array that announced it |
 /// | `ArrayStore` | `ArrayLoad` | a reader that sees the new array sees the descriptors in it |
-/// | `MappedStore` | `MappedLoad` | what moves to a segment that came is found there |
+/// | `MappedStore` | `MappedLoad` | a reader whose publisher saw a segment mapped finds objects that moved there |
 /// | `ReclaimFence` | `PinFence` | the publisher sees the pin, or the reader sees the tail |
 /// | `PinStore`, `UnpinStore` | `ScanLoad` | a pinned sample is read before it is written over |
 /// | `UnpinStore` | `FreeLoad` | a publisher that sees the next pin in a record knows that the last was read |
 /// | `OpenStore` | `GenerationLoad` | a publisher that sees a lane open sees its cursor |
 /// | `CloseStore`, `AskStore` | `GenerationLoad` | a publisher that sees a reader gone writes after it read |
 /// | `CursorStore` | `CursorLoad` | a sample is copied out before KEEP_ALL writes over it |
-/// | `NotedAdd` | `NotedLoad` | a follower that sees an entry counted sees the sample that it is of |
+/// | `NotedAdd` | `NotedLoad` | a follower that sees an entry counted sees the sample of that entry |
 /// | `ArmFence` | `SettleFence` | the sleeper sees the news, or the waker sees the ticket |
 /// | `LetGoSwap` | `TakeSwap` | a thread that takes a lock sees what its last holder did |
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -83,7 +83,7 @@ pub(crate) enum Site {
 }
 
 impl Site {
-    /// The ordering to use there.
+    /// Returns the ordering of this site.
     #[inline(always)]
     pub(crate) fn order(self) -> Ordering {
         #[cfg(test)]
@@ -129,11 +129,11 @@ impl Site {
     }
 }
 
-/// The fence of a site.
+/// Executes the fence of a site.
 #[inline(always)]
 pub(crate) fn fence_at<W: Word>(site: Site) {
     let order = site.order();
-    // No fence at all is what remains of a weakened one.
+    // A weakened fence is no fence at all.
     if order != Ordering::Relaxed {
         W::fence(order);
     }
@@ -173,10 +173,10 @@ impl Site {
         Self::LetGoSwap,
         Self::TakeSwap,
     ];
-    /// Names the site to weaken to a run of the models.
+    /// Environment variable that names the site to weaken in a run of the models.
     pub(crate) const WEAKEN: &str = "SHM_TEST_WEAKEN";
 
-    /// The next weaker ordering.
+    /// Returns the next weaker ordering.
     pub(crate) fn weaker(self) -> Ordering {
         match self.needed() {
             Ordering::SeqCst => Ordering::AcqRel,

@@ -8,24 +8,24 @@ use crate::ring::layout::LINE;
 /// The free ranges of an area.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Area {
-    /// Start and end in bytes, ascending, never touching each other.
+    /// Start and end of each free range in bytes, in ascending order; no two ranges touch.
     free: Vec<(u64, u64)>,
 }
 
 impl Area {
-    /// An area in which up to `pieces` pieces are expected at a time.
+    /// Creates an area in which up to `pieces` pieces are expected at a time.
     pub(crate) fn new(range: Range<u64>, pieces: usize) -> Self {
         let mut free = Vec::with_capacity(pieces + 1);
         free.push((range.start, range.end));
         Self { free }
     }
 
-    /// Bytes that `len` bytes take.
+    /// Returns the bytes that an allocation of `len` bytes takes.
     pub(crate) fn rounded(len: u64) -> u64 {
         len.max(1).next_multiple_of(LINE)
     }
 
-    /// Whether there is a place for `len` bytes below `limit`.
+    /// Returns whether there is space for `len` bytes below `limit`.
     pub(crate) fn fits_below(&self, limit: u64, len: u64) -> bool {
         self.find(limit, len).is_some()
     }
@@ -34,12 +34,12 @@ impl Area {
         self.free.iter().position(|&(start, end)| end.min(limit).saturating_sub(start) >= len)
     }
 
-    /// The lowest place for `len` bytes, which are whole lines.
+    /// Returns the lowest free range of `len` bytes, a multiple of the line size.
     pub(crate) fn allocate(&mut self, len: u64) -> Option<u64> {
         self.allocate_below(u64::MAX, len)
     }
 
-    /// As [`allocate`](Self::allocate), if it ends below `limit`.
+    /// Like [`allocate`](Self::allocate), if the range ends at or below `limit`.
     pub(crate) fn allocate_below(&mut self, limit: u64, len: u64) -> Option<u64> {
         let index = self.find(limit, len)?;
         let (start, end) = &mut self.free[index];
@@ -51,7 +51,7 @@ impl Area {
         Some(at)
     }
 
-    /// Gives back what [`Area::allocate`] gave.
+    /// Frees a range that [`Area::allocate`] returned.
     pub(crate) fn release(&mut self, at: u64, len: u64) {
         let index = self.free.partition_point(|&(start, _)| start < at);
         let touches_below = index > 0 && self.free[index - 1].1 == at;

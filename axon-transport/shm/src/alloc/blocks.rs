@@ -5,10 +5,11 @@ use std::collections::BTreeMap;
 
 use crate::{alloc::heap::Block, ring::layout::Location};
 
-/// What a ring keeps for lengths that it seems not to need any more, in bytes.
+/// Maximum number of free bytes that a ring keeps; more are given back before the ring allocates a block of a length
+/// for which it has none.
 const MAX_IDLE_BYTES: u64 = 64 << 10;
 
-/// Blocks by their length, those that were used last to be used next.
+/// Free blocks by length. The block that was freed last is reused first.
 #[derive(Debug, Default)]
 pub(crate) struct Blocks {
     free: BTreeMap<u64, Vec<Location>>,
@@ -16,25 +17,25 @@ pub(crate) struct Blocks {
 }
 
 impl Blocks {
-    /// One of `len` bytes.
+    /// Returns a block of `len` bytes.
     pub(crate) fn take(&mut self, len: u64) -> Option<Block> {
         let at = self.free.get_mut(&len)?.pop()?;
         self.bytes -= len;
         Some(Block { at, len })
     }
 
-    /// Nobody counts on what is in it any more.
+    /// Keeps a block for reuse. No reader counts on its content any more.
     pub(crate) fn put(&mut self, block: Block) {
         self.free.entry(block.len).or_default().push(block.at);
         self.bytes += block.len;
     }
 
-    /// Whether so much is here that it should go back before more is asked for.
+    /// Returns whether the free blocks should be given back before more memory is requested.
     pub(crate) fn are_many(&self) -> bool {
         self.bytes > MAX_IDLE_BYTES
     }
 
-    /// Gives all of them away.
+    /// Removes and returns all free blocks.
     pub(crate) fn drain(&mut self) -> impl Iterator<Item = Block> + use<> {
         self.bytes = 0;
         std::mem::take(&mut self.free)

@@ -1,5 +1,5 @@
-//! A bound on the memory that several rings take together: those that stand for publishers of one peer. Counters alone;
-//! nothing is reached by what they say.
+//! A bound on the memory that several rings take together: the rings that stand for the publishers of one peer. It only
+//! consists of counters, which guard no other memory.
 
 use std::sync::{
     Arc,
@@ -8,25 +8,25 @@ use std::sync::{
 
 use crate::error::ShmError;
 
-/// Memory that several rings may take together, in bytes. Each of them takes at most half of what the others leave, so
-/// none takes the last.
+/// Memory that several rings may take together, in bytes. Each ring takes at most half of what the others leave, so no
+/// ring takes all of it.
 #[derive(Debug)]
 pub struct MemoryBudget {
     most: u64,
     held: AtomicU64,
-    /// How often there was not as much as a ring asked for.
+    /// The number of refused requests.
     refused: AtomicU64,
-    /// What this one is a part of.
+    /// The pool that this budget is part of.
     pool: Option<Arc<Self>>,
 }
 
 impl MemoryBudget {
-    /// Allows up to `most` bytes.
+    /// Creates a budget of `most` bytes.
     pub fn new(most: u64) -> Arc<Self> {
         Self::with(most, None)
     }
 
-    /// Allows up to `most` bytes, and half of what others leave of a pool.
+    /// Creates a budget of `most` bytes, and of at most half of what others leave of `pool`.
     pub fn within(pool: &Arc<Self>, most: u64) -> Arc<Self> {
         Self::with(most, Some(Arc::clone(pool)))
     }
@@ -35,22 +35,23 @@ impl MemoryBudget {
         Arc::new(Self { most, held: AtomicU64::new(0), refused: AtomicU64::new(0), pool })
     }
 
-    /// The bound.
+    /// Returns the bound in bytes.
     pub fn most(&self) -> u64 {
         self.most
     }
 
-    /// What is taken now.
+    /// Returns the bytes that are taken now.
     pub fn held(&self) -> u64 {
         self.held.load(Ordering::Relaxed)
     }
 
-    /// How often a ring was refused memory since the start.
+    /// Returns how many requests for memory were refused since the start.
     pub fn refused(&self) -> u64 {
         self.refused.load(Ordering::Relaxed)
     }
 
-    /// Takes `bytes` for a part that has `own` of it. If they do not fit, the error is what would.
+    /// Takes `bytes` for a part that already has `own` bytes. If they do not fit, the error is the number of bytes that
+    /// would.
     fn take(&self, own: u64, bytes: u64) -> Result<(), u64> {
         let fits = |held: u64| {
             let share = self.most.saturating_sub(held.saturating_sub(own)) / 2;
@@ -68,17 +69,17 @@ impl MemoryBudget {
     }
 }
 
-/// What one ring takes of a budget. Given back when it is dropped.
+/// The part of a budget that one ring has taken. Given back when it is dropped.
 #[derive(Debug, Default)]
 pub(crate) struct Holding {
     of: Option<Arc<MemoryBudget>>,
     bytes: u64,
-    /// Refusals that were known when it was last asked.
+    /// The number of refusals at the last call of [`is_short`](Self::is_short).
     refused: u64,
 }
 
 impl Holding {
-    /// Of a budget.
+    /// Creates an empty holding of `budget`.
     pub(crate) fn of(budget: Arc<MemoryBudget>) -> Self {
         let refused = budget.refused();
         Self { of: Some(budget), bytes: 0, refused }
@@ -87,7 +88,7 @@ impl Holding {
     /// Takes `bytes` more.
     ///
     /// # Errors
-    /// The budget has not so much left.
+    /// The budget has less left.
     pub(crate) fn take(&mut self, bytes: u64) -> Result<(), ShmError> {
         let Some(of) = &self.of else { return Ok(()) };
         let pool_held = of.held();
@@ -118,7 +119,8 @@ impl Holding {
         }
     }
 
-    /// Whether a ring was refused memory since the last call: those that need none should give theirs back.
+    /// Returns whether any ring was refused memory since the last call. Rings then give back memory that they do not
+    /// need.
     pub(crate) fn is_short(&mut self) -> bool {
         let Some(of) = &self.of else { return false };
         let refused = of.refused();

@@ -4,26 +4,26 @@
 
 /// Slots are multiples of this many bytes.
 pub(crate) const PAGE: u64 = 4096;
-/// How many classes there are: up to 4 GiB.
+/// The number of classes; the largest is 4 GiB.
 pub(crate) const CLASSES: usize = 76;
 
-/// The class of the smallest slots that hold `len` bytes, which are at most 4 GiB.
+/// Returns the class of the smallest slots that hold `len` bytes; `len` is at most 4 GiB.
 pub(crate) fn class(len: u64) -> usize {
     let pages = len.max(1).div_ceil(PAGE);
-    // Up to eight pages a class each, from there on steps of a quarter of the power of two below.
+    // One class for each number of pages up to eight. Above, the steps are a quarter of the power of two below.
     let octave = pages.ilog2().saturating_sub(2);
     let quarters = pages.div_ceil(1 << octave) as usize;
     octave as usize * 4 + quarters - 1
 }
 
-/// Bytes of a slot of `class`.
+/// Returns the bytes of a slot of `class`.
 pub(crate) fn size(class: usize) -> u64 {
     let octave = (class / 4).saturating_sub(1);
     let quarters = class + 1 - 4 * octave;
     PAGE * ((quarters as u64) << octave)
 }
 
-/// Bytes of the slot that `len` bytes take.
+/// Returns the bytes of the slot that `len` bytes take.
 pub(crate) fn rounded(len: u64) -> u64 {
     size(class(len))
 }

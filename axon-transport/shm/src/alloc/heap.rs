@@ -23,18 +23,18 @@ use crate::{
     },
 };
 
-/// Readers may take this long to map a segment before objects that they read move there without
-/// them: one that is stopped must not keep a ring small.
+/// The time that readers have to map a segment before objects that they read move there without them: a stopped reader
+/// must not keep a ring small.
 const MAP_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// Memory of one object.
+/// The memory of one object.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Block {
     pub(crate) at: Location,
     pub(crate) len: u64,
 }
 
-/// A block, and the map that it is in. Not given back when dropped.
+/// A block and the map that contains it. Dropping it does not free the block.
 #[derive(Clone)]
 pub(crate) struct HeapObject {
     pub(crate) block: Block,
@@ -49,22 +49,22 @@ impl HeapObject {
     }
 }
 
-/// Whether an object may be where its readers do not look yet.
+/// Tells whether an object may be in a segment that its readers have not mapped.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Need {
-    /// If there is no other place.
+    /// It may, if there is no space elsewhere.
     Now,
-    /// It may not: rather none.
+    /// It may not; the allocation returns `None` instead.
     Mapped,
 }
 
-/// The segments that hold objects, and what of them is free.
+/// The segments that hold objects, and their free ranges.
 pub(crate) struct Heap(Mutex<Vec<HeapPart>>);
 
 struct HeapPart {
     segment: Arc<OwnSegment>,
     area: Area,
-    /// Where objects end that are no lanes.
+    /// End of the range for objects other than lanes.
     limit: u64,
     /// Bytes from the segment's start that are backed by memory.
     committed: u64,
@@ -84,7 +84,7 @@ impl HeapPart {
         self.area.fits_below(self.limit, len)
     }
 
-    /// As [`allocate`](Self::allocate); what is in its way is noted, if it is the first.
+    /// Like [`allocate`](Self::allocate), but stores the first error in `short`.
     fn give(&mut self, len: u64, short: &mut Option<ShmError>) -> Option<HeapObject> {
         self.allocate(len).unwrap_or_else(|error| {
             short.get_or_insert(error);
@@ -113,16 +113,16 @@ impl HeapPart {
 }
 
 impl Heap {
-    /// A heap in a session's first segment.
+    /// Creates a heap in a session's first segment.
     pub(crate) fn new(first: Arc<OwnSegment>) -> Self {
         Self(Mutex::new(vec![HeapPart::new(first)]))
     }
 
-    /// `len` bytes, best in a segment that is `mapped` by those that will read there. `None` when
-    /// there is room only where it is not, and that will not do: ask again later.
+    /// Allocates `len` bytes, preferably in a segment that is `mapped` by its readers. Returns `None` if there is space
+    /// only in another segment and `need` forbids that; the caller tries again later.
     ///
-    /// What is there may be what another object left, which somebody may still be reading, only to
-    /// find out that it is not good any more: it is to be written by words.
+    /// The memory may hold the content of an earlier object. A reader may still read that content, only to detect that
+    /// it is stale. So the memory must be written in atomic words.
     pub(crate) fn allocate(
         &self,
         segments: &Segments,
@@ -138,7 +138,7 @@ impl Heap {
         };
         let mut found = None;
         let mut elsewhere = false;
-        // Where one lacks memory, another may have some.
+        // If one segment lacks memory, another may have some.
         let mut short = None;
         for part in &mut *parts {
             if usable(part) {
@@ -161,8 +161,8 @@ impl Heap {
             found = parts.iter_mut().find_map(|part| part.give(len, &mut short));
         }
         drop(parts);
-        // The thread that gave this memory back did so after it raised a tail or replaced an array,
-        // and under the lock: readers that see what is written there now see that too.
+        // The thread that freed this memory did so after it had raised a tail or replaced an array, and under the lock.
+        // So readers that see the new content also see that tail or array.
         about_to_write::<AtomicU64>();
         match (found, short) {
             (None, Some(error)) => Err(error),
@@ -170,8 +170,7 @@ impl Heap {
         }
     }
 
-    /// Has a segment with room for `len` bytes, so that others have it, too, by the time that they
-    /// are needed.
+    /// Opens a segment if none has space for `len` bytes, so that other sessions have it by the time that it is needed.
     pub(crate) fn foresee(&self, segments: &Segments, len: u64) {
         let len = Area::rounded(len);
         let mut parts = self.parts();
@@ -191,16 +190,16 @@ impl Heap {
         Ok(HeapPart::new(segments.open(SegmentKind::Heap, bytes)?))
     }
 
-    /// Memory for a lane, always in the first segment. A reader's first request arrives there, before other
-    /// segments are mapped.
+    /// Allocates a lane, always in the first segment: a reader's first request arrives before other segments are
+    /// mapped.
     pub(crate) fn allocate_lane(&self) -> Result<HeapObject, ShmError> {
         let object = self.parts()[0].allocate_below(layout::SESSION_BYTES, layout::LANE)?;
-        // As for `allocate`: another object may have been there.
+        // As in `allocate`: another object may have been there.
         about_to_write::<AtomicU64>();
         Ok(object.expect("there is room for all lanes"))
     }
 
-    /// Takes a block back. Those who read there must have been told already.
+    /// Frees a block. The caller must first have shown its readers that the object is gone.
     pub(crate) fn release(&self, block: Block) {
         let mut parts = self.parts();
         if let Some(part) = parts.iter_mut().find(|p| p.segment.number() == block.at.segment) {
@@ -252,7 +251,7 @@ mod tests {
         let most = HEAP_BYTES - HEAP_AT;
         let second = heap.allocate(&segments, most, Need::Now, |_| true).unwrap().unwrap();
         heap.release(second.block);
-        // Of what it says is free, no byte can be backed.
+        // No byte of the range that is free here can be backed by memory.
         let end = layout::SESSION_BYTES;
         heap.parts()[0].area = Area::new(end..2 * end, 16);
         heap.parts()[0].committed = end;

@@ -11,30 +11,30 @@ use crate::{
     },
 };
 
-/// Where it is in a grant's generation.
+/// Position of the limit in a grant's generation, in bits.
 const SHIFT: u32 = 24;
 const BITS: u64 = (1 << 6) - 1;
-/// One more reader gets one part in so many of the remaining memory.
+/// Each further reader gets one part in this many of the remaining memory.
 const PART: u64 = 16;
 
-/// The longest sample that a reader may pin: a power of two in bytes, or none at all.
+/// The longest sample that a reader may pin: a power of two in bytes, or none.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct PinLimit {
-    /// Its binary logarithm; 0 for none.
+    /// The binary logarithm; 0 for none.
     power: u32,
 }
 
 impl PinLimit {
     pub(crate) const NONE: Self = Self { power: 0 };
-    /// For readers in the publisher's own session, to which it may do what it likes.
+    /// The limit for readers in the publisher's own session, which may pin everything.
     pub(crate) const ALL: Self = Self { power: BITS as u32 };
 
-    /// For samples of `len` bytes, and longer ones up to a power of two.
+    /// Returns the limit for samples of `len` bytes, rounded up to a power of two.
     fn at_least(len: u64) -> Self {
         Self { power: len.max(1).next_power_of_two().ilog2() }
     }
 
-    /// For samples of up to `len` bytes, rounded down.
+    /// Returns the limit for samples of up to `len` bytes, rounded down to a power of two.
     fn at_most(len: u64) -> Self {
         // Shorter samples are never pinned.
         if len > COPIED_ALWAYS { Self { power: len.ilog2() } } else { Self::NONE }
@@ -44,36 +44,36 @@ impl PinLimit {
         Self { power: (generation >> SHIFT & BITS) as u32 }
     }
 
-    /// Its part of a generation.
+    /// Returns the limit's bits of a generation.
     pub(crate) fn bits(self) -> u64 {
         u64::from(self.power) << SHIFT
     }
 
-    /// The longest sample in bytes.
+    /// Returns the longest sample in bytes.
     pub(crate) fn longest(self) -> u64 {
         if self == Self::NONE { 0 } else { 1 << self.power }
     }
 }
 
-/// What there is to be shared out.
+/// The memory of a publisher that readers may pin.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct PinPool {
-    /// Bytes that all readers of other sessions may keep together. What this leaves of the publisher's
-    /// segments is more than half of them.
+    /// Bytes that all readers of other sessions may pin together. The rest of the publisher's segments is more than
+    /// half of them.
     bytes: u64,
-    /// The largest slot.
+    /// The largest slot in bytes.
     largest: u64,
 }
 
 impl PinPool {
-    /// Of a publisher with this budget.
+    /// Creates the pool of a publisher with this budget.
     pub(crate) fn new(budget: u64, max_message: u64) -> Self {
         let segment = samples_bytes(budget, max_message, RECORDS as u64) - SLOTS_AT;
         Self { bytes: segment / 2 * 3, largest: classes::rounded(max_message) }
     }
 
-    /// What a reader may get where `taken` bytes have been given out, `process` of them to its own
-    /// process, which gets no more than three quarters of all.
+    /// Returns the limit for a new reader, if `taken` bytes have been granted and `process` of them to the reader's own
+    /// process. A process gets at most three quarters of all.
     pub(crate) fn share(&self, taken: u64, process: u64) -> PinLimit {
         let whole = PinLimit::at_least(self.largest);
         if taken + self.cost(whole) <= self.bytes / 2 {
@@ -84,19 +84,18 @@ impl PinPool {
         PinLimit::at_most(left / PART / RECORDS as u64)
     }
 
-    /// Bytes that a reader may keep in all.
+    /// Returns the bytes that a reader with this limit may pin in total.
     pub(crate) fn cost(&self, pin_limit: PinLimit) -> u64 {
         RECORDS as u64 * pin_limit.longest().min(self.largest)
     }
 }
 
-/// Bytes of a publisher's segment for a history of `budget` bytes of samples of at most
-/// `max_message` bytes. All of it is address space, not memory.
+/// Returns the bytes of a publisher's segment for a history of `budget` bytes and samples of at most `max_message`
+/// bytes. All of it is address space; memory is committed as needed.
 pub(crate) fn samples_bytes(budget: u64, max_message: u64, pins: u64) -> u64 {
-    // Room for four of the largest, so that one of them always fits beside one that stands; and
-    // for as many as two readers can pin. Twice the budget, so that pieces between samples seldom
-    // shorten the history.
-    // One that is lent behind a header may begin so much later.
+    // Four of the largest samples have room, so that one always fits beside one that is kept; and as many as two
+    // readers can pin. Twice the budget has room, so that gaps between samples seldom shorten the history. A sample
+    // behind a header may begin up to `ALIGNED` bytes later.
     let largest = classes::rounded(max_message + ALIGNED as u64);
     let bytes = (4 * largest).max(2 * budget) + 2 * pins * largest;
     (SLOTS_AT + bytes).next_multiple_of(ALIGN).min(MAX_SEGMENT)
@@ -122,7 +121,7 @@ mod tests {
         );
     }
 
-    /// What `readers` get one after the other, each of a process of its own or all of one.
+    /// Returns the limits of `readers` readers that attach one after the other, all in one process or each in its own.
     fn shares(pool: PinPool, readers: usize, one_process: bool) -> Vec<u64> {
         let mut taken = 0;
         let mut shares = Vec::new();
@@ -137,7 +136,7 @@ mod tests {
 
     #[test]
     fn two_readers_keep_any_sample_and_many_keep_shorter_ones() {
-        // As publishers usually are.
+        // The defaults of a publisher.
         let shares = shares(PinPool::new(64 * MIB, 256 * MIB), 1000, false);
         assert_eq!(shares[..2], [256 * MIB; 2]);
         assert!(shares[2..16].iter().all(|longest| *longest >= 8 * MIB), "{shares:?}");

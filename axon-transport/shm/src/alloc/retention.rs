@@ -3,19 +3,19 @@
 
 use std::time::{Duration, Instant};
 
-/// Memory that holds nothing and was not used for this long is given up.
+/// Memory that holds no sample and was not used for this long is released.
 pub(crate) const IDLE: Duration = Duration::from_secs(10);
-/// Memory is given up when this many times less was enough for as long.
+/// Memory is released if this factor less was enough for [`IDLE`].
 const SURPLUS: u64 = 4;
-/// So much is never too much, in bytes.
+/// Memory up to this size in bytes is never too much.
 const MODEST: u64 = 1 << 20;
 
-/// What was used of a segment.
+/// The recent use of a segment.
 #[derive(Debug)]
 pub(crate) struct Retention {
-    /// Whether there was a large sample since the last look.
+    /// True if there was a large sample since the last check.
     used: bool,
-    /// The last look that found one.
+    /// The last check that found a large sample.
     last: Instant,
     /// The most bytes in use since `since`.
     peak: u64,
@@ -27,15 +27,15 @@ impl Retention {
         Self { used: true, last: now, peak: 0, since: now }
     }
 
-    /// There is a large sample, and with it `bytes` are in use.
+    /// Records a large sample, with which `bytes` are in use.
     #[inline]
     pub(crate) fn used(&mut self, bytes: u64) {
         self.used = true;
         self.peak = self.peak.max(bytes);
     }
 
-    /// Looks at a segment with `backed` bytes of memory, of which `bytes` are in use. Whether it
-    /// should be left.
+    /// Checks a segment with `backed` bytes of memory, of which `bytes` are in use. Returns whether the publisher
+    /// should leave it.
     pub(crate) fn is_over(&mut self, now: Instant, bytes: u64, backed: u64) -> bool {
         if std::mem::take(&mut self.used) {
             self.last = now;

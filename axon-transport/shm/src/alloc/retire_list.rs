@@ -5,14 +5,14 @@ use std::ops::Range;
 
 use crate::{alloc::slots::SegmentSlots, ring::layout::Location};
 
-/// Retired samples by segment. One store at a time takes new samples. A store that was left is
-/// [vacated](Self::vacated) once its last sample has been released.
+/// Retired samples by segment. One segment at a time takes new samples. The publisher leaves a segment when it opens
+/// another; the segment is [vacated](Self::vacated) once its last sample has been released.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct RetireList {
-    /// The last one takes new samples, unless it was left.
+    /// The last segment takes new samples, unless the publisher left it.
     stores: Vec<Store>,
     retired: Vec<Retired>,
-    /// Loans that were not published yet.
+    /// The number of loans that are not published yet.
     loans: u32,
 }
 
@@ -33,34 +33,34 @@ struct Retired {
 }
 
 impl RetireList {
-    /// Makes the segment of this number take new samples, in `range`.
+    /// Adds a segment that takes new samples in `range`, and leaves the others.
     pub(crate) fn open(&mut self, number: u32, range: Range<u64>) {
         self.leave();
         self.stores.push(Store { number, slots: SegmentSlots::new(range, 16), left: false });
     }
 
-    /// Makes all segments refuse new samples until another one is opened.
+    /// Leaves all segments: none takes new samples until another one is opened.
     pub(crate) fn leave(&mut self) {
         self.stores.iter_mut().for_each(|store| store.left = true);
     }
 
-    /// The slots of the segment at a loan's location.
+    /// Returns the slots of the segment at a loan's location.
     pub(crate) fn slots(&mut self, at: Location) -> &mut SegmentSlots {
         slots(&mut self.stores, at)
     }
 
-    /// Bytes in use, and bytes backed by memory, of the segment that takes new samples.
+    /// Returns the bytes in use of the segment that takes new samples, and the end of its backed memory.
     pub(crate) fn extent(&self) -> Option<(u64, u64)> {
         let store = self.stores.last().filter(|store| !store.left)?;
         Some((store.slots.used(), store.slots.backed()))
     }
 
-    /// The numbers of all segments.
+    /// Returns the numbers of all segments.
     pub(crate) fn segments(&self) -> impl ExactSizeIterator<Item = u32> + '_ {
         self.stores.iter().map(|store| store.number)
     }
 
-    /// A free slot in the segment that takes new samples.
+    /// Takes a free slot in the segment that takes new samples.
     pub(crate) fn take(&mut self, len: u64) -> Option<Location> {
         self.take_by(|slots| slots.take(len))
     }
@@ -71,17 +71,17 @@ impl RetireList {
         Some(Location { segment: store.number, offset })
     }
 
-    /// Returns an unpublished slot.
+    /// Releases a slot that was not published.
     pub(crate) fn put_back(&mut self, at: Location, len: u64) {
         slots(&mut self.stores, at).release(at.offset, len);
     }
 
-    /// Returns a slot that could not be backed by memory.
+    /// Releases a slot that could not be backed by memory.
     pub(crate) fn release_unbacked(&mut self, at: Location, len: u64) {
         slots(&mut self.stores, at).release_unbacked(at.offset, len);
     }
 
-    /// A free slot for a loan, in a segment that was left only if there is none elsewhere.
+    /// Takes a free slot for a loan. Uses a segment that was left only if no other has space.
     pub(crate) fn lend(&mut self, len: u64) -> Option<Location> {
         let at = self.take(len).or_else(|| {
             let mut left = self.stores.iter_mut().filter(|store| store.left);
@@ -94,15 +94,15 @@ impl RetireList {
         Some(at)
     }
 
-    /// As [`lend`](Self::lend), while slots [take turns](SegmentSlots::take_turn).
+    /// Like [`lend`](Self::lend), as long as slots [rotate](SegmentSlots::take_turn).
     pub(crate) fn lend_turn(&mut self, len: u64) -> Option<Location> {
         let at = self.take_by(|slots| slots.take_turn(len))?;
         self.loans += 1;
         Some(at)
     }
 
-    /// Whether there would be room for `len` bytes if these samples were given up, and nothing that
-    /// readers keep: with no more memory than there is, unless it can `grow`.
+    /// Returns whether there would be space for `len` bytes if `samples` were given up, without the memory that readers
+    /// pin. Counts only backed memory, unless the segments can `grow`.
     pub(crate) fn would_hold(
         &self,
         len: u64,
@@ -118,42 +118,42 @@ impl RetireList {
         })
     }
 
-    /// The loan was not published.
+    /// Releases a loan that was not published.
     pub(crate) fn give_back(&mut self, at: Location, len: u64) {
         self.put_back(at, len);
         self.loans -= 1;
     }
 
-    /// There is no memory for the loan.
+    /// Releases a loan for which there is no memory.
     pub(crate) fn withdraw(&mut self, at: Location, len: u64) {
         self.release_unbacked(at, len);
         self.loans -= 1;
     }
 
-    /// The loan was published.
+    /// Records that a loan was published.
     pub(crate) fn published(&mut self) {
         self.loans -= 1;
     }
 
-    /// The sample at `position`, of `sample` bytes in a slot of `len`, has been given up; readers may
-    /// still be at it.
+    /// Adds the sample at `position`, of `sample` bytes in a slot of `len` bytes, which has been given up. Readers may
+    /// still read it.
     pub(crate) fn retire(&mut self, position: u64, at: Location, len: u64, sample: u64) {
         self.retired.push(Retired { position, at, len, sample });
     }
 
-    /// Frees what no reader pins, by position and length of the sample: that is what a reader goes by, so
-    /// one that was lent more keeps all of it. The tail must have been raised above all that is here before
-    /// the pins were looked at.
+    /// Frees the samples that no reader pins, by position and length. A reader's limit applies to the length of the
+    /// sample, so a sample in a longer loan keeps the whole slot. The tail must have been raised above all retired
+    /// positions before the pins were read.
     pub(crate) fn reclaim(&mut self, pinned: impl Fn(u64, u64) -> bool) {
         let keeps = |retired: &Retired| pinned(retired.position, retired.sample);
-        // The last ones first, so that the ones that were read longest ago are taken first.
+        // In reverse order, so that the slots that were read longest ago are reused first.
         for Retired { at, len, .. } in self.retired.iter().rev().filter(|retired| !keeps(retired)) {
             slots(&mut self.stores, *at).release(at.offset, *len);
         }
         self.retired.retain(keeps);
     }
 
-    /// The positions of samples that were given up and not reclaimed.
+    /// Returns the positions of samples that were given up and not reclaimed.
     pub(crate) fn retired(&self) -> impl ExactSizeIterator<Item = u64> + '_ {
         self.retired.iter().map(|retired| retired.position)
     }
@@ -162,7 +162,8 @@ impl RetireList {
         self.loans
     }
 
-    /// Forgets the segments that were left and hold nothing any more, and names them, each with how far it is backed.
+    /// Removes the segments that were left and hold no sample. Returns their numbers, each with the end of its backed
+    /// memory.
     pub(crate) fn vacated(&mut self) -> Vec<(u32, u64)> {
         let vacant = |store: &Store| store.left && store.slots.used() == 0;
         let vacated = self.stores.iter().filter(|store| vacant(store));
@@ -174,7 +175,7 @@ impl RetireList {
 
 fn slots(stores: &mut [Store], at: Location) -> &mut SegmentSlots {
     let store = stores.iter_mut().find(|store| store.number == at.segment);
-    // A segment is only forgotten once it holds nothing.
+    // A segment is removed only once it holds nothing.
     &mut store.expect("the segment of what is in use").slots
 }
 

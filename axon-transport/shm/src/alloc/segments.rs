@@ -14,30 +14,30 @@ use crate::{
     ring::layout::{self, SegmentKind},
 };
 
-/// A segment as other sessions are told of it.
+/// The description of a segment that other sessions receive.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SegmentInfo {
-    /// Its number in its session: from 0, never used again.
+    /// The segment's number in its session, counted from 0. Numbers are never reused.
     pub number: u32,
-    /// What it is for.
+    /// The purpose of the segment.
     pub kind: SegmentKind,
 }
 
-/// What a session's owner passes on to the others, in this order.
+/// An event that a session's owner passes on to the other sessions. The order of events must be kept.
 #[derive(Clone, Copy, Debug)]
 pub enum SegmentEvent<'a> {
-    /// A segment came into being, in which there will be what others read.
+    /// A segment was opened. Objects that others read will be in it.
     Opened(SegmentInfo, BorrowedFd<'a>),
-    /// A segment is given up: nobody reads it any more.
+    /// A segment was closed: nobody reads it any more.
     Gone(SegmentInfo),
-    /// This publisher would be glad if somebody [prepared](crate::writer::Writer::prepare) it for its next
-    /// sample. Nobody else needs to know.
+    /// This publisher asks its owner to [prepare](crate::writer::Writer::prepare) memory for its next sample. Other
+    /// sessions do not need this event.
     Low(Gid),
 }
 
 type Listener = Box<dyn Fn(SegmentEvent<'_>) + Send + Sync>;
 
-/// One of them.
+/// One segment of a session.
 pub(crate) struct OwnSegment {
     pub(crate) info: SegmentInfo,
     pub(crate) memory: OwnMapping,
@@ -60,7 +60,7 @@ impl OwnSegment {
     }
 }
 
-/// All of them.
+/// All segments of a session.
 pub(crate) struct Segments {
     session: SessionId,
     table: RwLock<SegmentTable>,
@@ -78,20 +78,20 @@ impl Segments {
         Self { session, table: RwLock::default(), listener: OnceLock::new() }
     }
 
-    /// Has `listener` hear of each segment from now on, in the order of their numbers. It is called
-    /// while locks are held: it must not block, nor call into the session.
+    /// Sets `listener`, which is called for each later segment, in the order of their numbers. It is called while locks
+    /// are held: it must neither block nor call into the session. Returns false if there is a listener already.
     pub(crate) fn listen(&self, listener: Listener) -> bool {
         self.listener.set(listener).is_ok()
     }
 
-    /// Tells the listener.
+    /// Calls the listener.
     pub(crate) fn tell(&self, event: SegmentEvent<'_>) {
         if let Some(listener) = self.listener.get() {
             listener(event);
         }
     }
 
-    /// A new segment of `bytes` bytes, of which the first [`layout::ALIGN`] are backed by memory.
+    /// Opens a new segment of `bytes` bytes, of which the first [`layout::ALIGN`] are backed by memory.
     pub(crate) fn open(&self, kind: SegmentKind, bytes: u64) -> Result<Arc<OwnSegment>, ShmError> {
         let name = match kind {
             SegmentKind::Session => "axon-session",
@@ -113,7 +113,7 @@ impl Segments {
         Ok(segment)
     }
 
-    /// Nothing in the segment is of use to anybody any more.
+    /// Closes a segment whose content nobody needs any more.
     pub(crate) fn close(&self, number: u32) {
         let mut table = self.table.write().unwrap_or_else(PoisonError::into_inner);
         if let Some(segment) = table.live.remove(&number) {
@@ -125,7 +125,7 @@ impl Segments {
         self.table.read().unwrap_or_else(PoisonError::into_inner).live.get(&number).cloned()
     }
 
-    /// What there is besides the first, by number.
+    /// Returns the segments other than the first, by number.
     pub(crate) fn further(&self) -> Vec<Arc<OwnSegment>> {
         let table = self.table.read().unwrap_or_else(PoisonError::into_inner);
         table.live.values().filter(|s| s.info.kind != SegmentKind::Session).cloned().collect()

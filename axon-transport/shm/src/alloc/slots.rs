@@ -1,12 +1,12 @@
-//! The free bytes of a segment that can hold large samples: plain data of the publisher alone.
+//! The free memory of a segment for large samples. Plain data that only the publisher uses.
 //!
 //! A returned slot goes on top of the list of its [class](super::classes), and the next sample of that class takes
 //! it from there, because its memory is warm in the caches. If the list is empty, the allocator takes backed memory
 //! that is in no list, then a slot of one of the next larger classes. Only if all of that fails does it empty the
 //! lists, join adjacent ranges, and take the lowest range that is large enough, so that memory grows last.
 //!
-//! Slots that fit in a core's own cache are also [used in rotation](SegmentSlots::take_turn). If the publisher wrote to the
-//! slot that was read last, each cache line would first have to move from the reader's core.
+//! Slots that fit in a core's own cache are also [used in rotation](SegmentSlots::take_turn). If the publisher wrote to
+//! the slot that was read last, each cache line would first have to move from the reader's core.
 
 use std::ops::Range;
 
@@ -15,9 +15,9 @@ use crate::alloc::{
     classes::{self, CLASSES},
 };
 
-/// Next larger classes whose free slots may be used: slots up to twice as large.
+/// Number of next larger classes whose free slots may be used: slots up to twice as large.
 const HELPERS: usize = 4;
-/// Slots that rotate.
+/// Number of slots that rotate.
 pub(crate) const TURNS: u32 = 4;
 /// Largest slot that rotates, in bytes. Above it, four buffers cost more than waiting.
 const TURNING: u64 = 512 << 10;
@@ -25,24 +25,25 @@ const TURNING: u64 = 512 << 10;
 /// The slots of one segment.
 #[derive(Clone, Debug)]
 pub(crate) struct SegmentSlots {
-    /// Free slots by class, the one that came back last on top.
+    /// Free slots by class, the one that was released last on top.
     free: Vec<Vec<u64>>,
-    /// What is in no slot.
+    /// The ranges that are in no slot.
     rest: Area,
     /// Slots in use that are of a larger class than their samples: start and class.
     larger: Vec<(u64, usize)>,
-    /// Where the first slot can be.
+    /// The lowest start of a slot.
     start: u64,
-    /// Up to here there is memory.
+    /// The end of the memory that is backed.
     backed: u64,
-    /// Memory was short once.
+    /// True if a slot could once not be backed.
     short: bool,
     /// Bytes of the slots in use.
     used: u64,
 }
 
 impl SegmentSlots {
-    /// Slots in `range`, none of which is backed by memory. Up to `pieces` are expected at a time.
+    /// Creates the slots of `range`, none of which is backed by memory. Up to `pieces` free ranges are expected at a
+    /// time.
     pub(crate) fn new(range: Range<u64>, pieces: usize) -> Self {
         Self {
             free: vec![Vec::new(); CLASSES],
@@ -55,8 +56,8 @@ impl SegmentSlots {
         }
     }
 
-    /// The start of a slot that holds `len` bytes, in memory where any is free. Otherwise it must
-    /// be [backed](Self::back) before it is touched.
+    /// Takes a slot for `len` bytes and returns its start. Prefers backed memory. Other memory must be
+    /// [backed](Self::back) before it is used.
     pub(crate) fn take(&mut self, len: u64) -> Option<u64> {
         let class = classes::class(len);
         let bytes = classes::size(class);
@@ -72,8 +73,8 @@ impl SegmentSlots {
         Some(at)
     }
 
-    /// As [`take`](Self::take), where that helps turns and disturbs nothing: a slot that is free, or
-    /// of memory that is in no list. To have as many as take turns, memory grows, unless it was
+    /// Like [`take`](Self::take), for slots that rotate, without effects on other slots: takes a free slot of the
+    /// class, or memory that is in no list. Memory grows until there are as many slots as rotate, unless memory was
     /// short once.
     pub(crate) fn take_turn(&mut self, len: u64) -> Option<u64> {
         let class = classes::class(len);
@@ -89,7 +90,7 @@ impl SegmentSlots {
         Some(at)
     }
 
-    /// Gives back the slot at `at`, which was taken for `len` bytes.
+    /// Releases the slot at `at`, which was taken for `len` bytes.
     pub(crate) fn release(&mut self, at: u64, len: u64) {
         let mut class = classes::class(len);
         if let Some(index) = self.larger.iter().position(|&(start, _)| start == at) {
@@ -99,46 +100,46 @@ impl SegmentSlots {
         self.free[class].push(at);
     }
 
-    /// Gives back the slot at `at`, which was taken for `len` bytes and could not be backed.
+    /// Releases the slot at `at`, which was taken for `len` bytes and could not be backed.
     pub(crate) fn release_unbacked(&mut self, at: u64, len: u64) {
-        // It was taken of what is in no list. In one it would be the next to be tried.
+        // The slot came from memory that is in no list. In a list it would be the next slot to be tried.
         let bytes = classes::rounded(len);
         self.used -= bytes;
         self.rest.release(at, bytes);
         self.short = true;
     }
 
-    /// Whether another slot like that of `len` bytes is at hand.
+    /// Returns whether a free slot of the class of `len` bytes is ready.
     pub(crate) fn has_another(&self, len: u64) -> bool {
         !self.free[classes::class(len)].is_empty()
     }
 
-    /// Up to where there is memory.
+    /// Returns the end of the memory that is backed.
     pub(crate) fn backed(&self) -> u64 {
         self.backed
     }
 
-    /// There is memory up to `end` now.
+    /// Records that memory is backed up to `end`.
     pub(crate) fn back(&mut self, end: u64) {
         self.backed = self.backed.max(end);
     }
 
-    /// The end of the slot at `at`, which was taken for `len` bytes.
+    /// Returns the end of the slot at `at`, which was taken for `len` bytes.
     pub(crate) fn end(&self, at: u64, len: u64) -> u64 {
         at + self.size_of(at, classes::class(len))
     }
 
-    /// Bytes of the slots in use.
+    /// Returns the bytes of the slots in use.
     pub(crate) fn used(&self) -> u64 {
         self.used
     }
 
-    /// A slot of memory that is in no list.
+    /// Takes a slot from backed memory that is in no list.
     fn cut_backed(&mut self, bytes: u64) -> Option<u64> {
         self.rest.allocate_below(self.backed, bytes)
     }
 
-    /// The smallest free slot of the next larger classes.
+    /// Takes the smallest free slot of the next larger classes.
     fn borrow(&mut self, class: usize) -> Option<u64> {
         let helpers = class + 1..CLASSES.min(class + 1 + HELPERS);
         let (helper, at) =
@@ -147,7 +148,7 @@ impl SegmentSlots {
         Some(at)
     }
 
-    /// Gives up all lists.
+    /// Empties all lists into `rest`.
     fn join(&mut self) {
         for (class, list) in self.free.iter_mut().enumerate() {
             for at in list.drain(..) {
@@ -174,7 +175,7 @@ mod tests {
         SegmentSlots::new(0..bytes, 16)
     }
 
-    /// As a publisher does: what is taken is backed.
+    /// Takes a slot and backs it, as a publisher does.
     fn take(slots: &mut SegmentSlots, len: u64) -> Option<u64> {
         let at = slots.take(len)?;
         slots.back(slots.end(at, len));
@@ -200,7 +201,7 @@ mod tests {
         assert_eq!(slots.end(first[3], len), 4 * len);
         slots.back(4 * len);
         assert_eq!(slots.take_turn(len), None, "memory grows no further for that");
-        // They come back as a publisher finds them to be read: the one published last first.
+        // The publisher reclaims them newest first.
         first.iter().rev().for_each(|at| slots.release(*at, len));
         let again: Vec<_> = (0..4).map(|_| slots.take_turn(len).unwrap()).collect();
         assert_eq!(again, first);
@@ -281,8 +282,8 @@ mod tests {
     }
 
     proptest! {
-        /// Sizes and turns as they come: no two slots overlap, nothing is lost, and memory stays
-        /// within a small multiple of what was ever in use at once.
+        /// For any sequence of sizes and turns, no two slots overlap, no memory is lost, and backed memory stays within
+        /// a small multiple of the peak use.
         #[test]
         fn slots_never_overlap_and_all_comes_back(
             turns in proptest::collection::vec((4097u64..3 << 20, any::<prop::sample::Index>(), 0usize..12), 1..300),

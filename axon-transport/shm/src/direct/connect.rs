@@ -32,14 +32,14 @@ use crate::{
     },
 };
 
-/// First of each packet.
+/// The protocol version, the first field of each packet.
 const VERSION: u32 = 2;
 const MAX_PACKET: usize = 1024;
 const MAX_DESCRIPTORS: usize = 4;
-/// The longest reason that is told.
+/// The maximum length of a refusal's reason, in bytes.
 const MAX_REASON: usize = 256;
 
-/// A subscriber and a publisher did not come together.
+/// A subscriber and a publisher could not connect.
 ///
 /// ```
 /// use std::{os::unix::net::UnixDatagram, time::Duration};
@@ -56,24 +56,24 @@ const MAX_REASON: usize = 256;
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum ConnectError {
-    /// Memory was not to be had, or what the other end handed over was refused.
+    /// Memory could not be allocated, or an object that the other end passed was refused.
     #[error(transparent)]
     Memory(#[from] ShmError),
-    /// The subscriber requests what the publisher does not offer.
+    /// The publisher does not offer the QoS that the subscriber requests.
     #[error(
         "the publisher does not offer the {0} that the subscriber requests: \
          offer more, or request less"
     )]
     Incompatible(Incompatible),
-    /// The publisher refused, and said why.
+    /// The publisher refused, for this reason.
     #[error("the publisher refused: {0}")]
     Refused(String),
-    /// The other end sent something else than it should.
+    /// The other end broke the protocol.
     #[error(
         "the other end sent {0}: is there a publisher at one end and a subscriber at the other?"
     )]
     Protocol(&'static str),
-    /// The other end did nothing in time.
+    /// The other end did not answer in time.
     #[error(
         "the other end did not answer in time: a publisher must serve while a subscriber connects"
     )]
@@ -95,7 +95,7 @@ impl From<Errno> for ConnectError {
     }
 }
 
-/// What a subscriber asks.
+/// A subscriber's request to attach to a ring.
 #[derive(Clone, Copy, Debug, Encode, Decode)]
 pub(crate) struct AttachRequest {
     #[n(0)]
@@ -108,10 +108,10 @@ pub(crate) struct AttachRequest {
     pub(crate) qos: Qos,
 }
 
-/// What a publisher answers.
+/// A publisher's answer to an [`AttachRequest`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
 pub(crate) struct PublisherAnswer {
-    /// Who asked: an answer to a question that was given up is not one to the next.
+    /// The reader that asked. A reader that gave up a request ignores an answer to it that arrives later.
     #[n(0)]
     pub(crate) reader: Gid,
     #[n(1)]
@@ -170,16 +170,16 @@ impl Packet {
     }
 }
 
-/// Decodes a packet and encodes it anew; `None` where it is refused. For this
-/// project's fuzz target `connect_packet`.
+/// Decodes a packet and encodes it again; `None` if the decoder refuses it. For this project's fuzz target
+/// `connect_packet`.
 #[doc(hidden)]
 #[must_use]
 pub fn reencode_packet(bytes: &[u8]) -> Option<Vec<u8>> {
     Packet::decode(bytes).and_then(|packet| packet.encode()).ok()
 }
 
-/// The two ends over which a publisher hands segments to a subscriber: theirs alone, so that what
-/// else is said over the socket by which they met stays apart.
+/// Creates the socket pair over which a publisher passes segments to a subscriber. Only these two use it, so the
+/// segments are not mixed with other traffic on the socket over which they connected.
 pub(crate) fn line() -> Result<(OwnedFd, OwnedFd), ConnectError> {
     let (family, kind) = (AddressFamily::UNIX, SocketType::SEQPACKET);
     Ok(socketpair(family, kind, SocketFlags::CLOEXEC, None)?)
@@ -189,11 +189,11 @@ fn no_descriptors() -> ConnectError {
     ShmError::System { what: "receiving descriptors", source: Errno::MFILE.into() }.into()
 }
 
-/// One end of the socket, for as long as the two need to come together.
+/// One end of the socket, while the two ends connect.
 pub(crate) struct ConnectChannel<'a> {
     socket: BorrowedFd<'a>,
     deadline: Option<Instant>,
-    /// Whether it has received something.
+    /// True once the channel tried to receive.
     heard: Cell<bool>,
 }
 
@@ -203,7 +203,7 @@ impl<'a> ConnectChannel<'a> {
         Self { socket, deadline, heard: Cell::new(false) }
     }
 
-    /// Asks, and hands over the end of a [line] over which segments are to come.
+    /// Sends a request, and passes the end of a [line] over which segments will arrive.
     pub(crate) fn ask(
         &self,
         asked: &AttachRequest,
@@ -225,7 +225,7 @@ impl<'a> ConnectChannel<'a> {
                 if asked.reader.0[..12] != asked.session.0[..12] {
                     return Err(ConnectError::Protocol("a GID that is not its own"));
                 }
-                // Sending to anything else could block.
+                // A send to a socket of another kind could block.
                 if sockopt::socket_domain(&line) != Ok(AddressFamily::UNIX)
                     || sockopt::socket_type(&line) != Ok(SocketType::SEQPACKET)
                 {
@@ -246,7 +246,7 @@ impl<'a> ConnectChannel<'a> {
         self.send(&Packet::Granted(*granted), &fds)
     }
 
-    /// The answer to what `reader` asked.
+    /// Waits for the answer to the request of `reader`.
     pub(crate) fn await_granted(
         &self,
         reader: Gid,
@@ -271,7 +271,7 @@ impl<'a> ConnectChannel<'a> {
         }
     }
 
-    /// Hands a segment over.
+    /// Passes a segment to the subscriber.
     pub(crate) fn hand(
         &self,
         session: SessionId,
@@ -281,13 +281,13 @@ impl<'a> ConnectChannel<'a> {
         self.send(&Packet::Opened(SegmentOpened { session, segment: info.into() }), &[fd])
     }
 
-    /// Says that a segment is given up.
+    /// Tells the subscriber that a segment was dropped.
     pub(crate) fn withdraw(&self, session: SessionId, number: u32) -> Result<(), ConnectError> {
         self.send(&Packet::Gone(SegmentName { session, number }), &[])
     }
 
-    /// The next segment that is handed over or given up. One for whose descriptor there is no room
-    /// stays where it is. For one thread at a time.
+    /// Returns the next opened or dropped segment. A packet for whose descriptor this process has no room stays in the
+    /// socket. Only one thread at a time may call this.
     pub(crate) fn take_update(&self) -> Result<SegmentUpdate, ConnectError> {
         loop {
             match self.receive_by(descriptors::receive_whole)? {
@@ -302,7 +302,7 @@ impl<'a> ConnectChannel<'a> {
         }
     }
 
-    /// Tells the subscriber that it is not admitted, if it still listens.
+    /// Tells the subscriber that it is not admitted, if it still listens. Ignores errors.
     pub(crate) fn refuse(&self, reader: Gid, why: &ConnectError) {
         let mut reason = why.to_string();
         let end = (0..=MAX_REASON.min(reason.len())).rev().find(|&i| reason.is_char_boundary(i));
@@ -328,8 +328,8 @@ impl<'a> ConnectChannel<'a> {
         }
     }
 
-    /// The next packet. One that is there is taken whatever the time, but only the first: another end
-    /// that sends without pause gains none.
+    /// Returns the next packet. The first packet is received even after the deadline if it is already there. Later ones
+    /// are not, so an end that sends without pause cannot extend the deadline.
     fn receive(&self) -> Result<(Packet, Vec<PassedFd>), ConnectError> {
         self.receive_by(descriptors::receive)
     }
@@ -370,7 +370,7 @@ impl<'a> ConnectChannel<'a> {
         self.deadline.map(|deadline| deadline.saturating_duration_since(Instant::now()))
     }
 
-    /// Waits until the socket is ready, and not beyond the deadline.
+    /// Waits until the socket is ready, at most until the deadline.
     fn until(&self, events: PollFlags) -> Result<(), ConnectError> {
         let left = self.left();
         if left.is_some_and(|left| left.is_zero()) {

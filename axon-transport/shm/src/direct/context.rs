@@ -28,11 +28,11 @@ use crate::{
     },
 };
 
-/// Segments of one other context that are kept to be mapped later, at most.
+/// Most segments of one other context that are kept to be mapped later.
 const MAX_KEPT_SEGMENTS: usize = 64;
 
-/// The memory, doorbell and identity that publishers and subscribers of a process share. Starts no
-/// thread. Clones are the same context; all methods may be called from any thread.
+/// The memory, doorbell and identity that publishers and subscribers of a process share. It starts no thread. Clones
+/// share the same context. All methods may be called from any thread.
 ///
 /// ```
 /// use axon_shm::{Context, Publisher, PublisherOptions, qos::Qos};
@@ -51,32 +51,32 @@ pub struct Context {
 struct ContextInner {
     session: Arc<SessionSegment>,
     entities: AtomicU32,
-    /// The other contexts, each mapped once.
+    /// The other contexts; each is mapped once.
     peers: Mutex<HashMap<SessionId, MappedContext>>,
     lines: Arc<SegmentChannels>,
-    /// What other contexts handed over and could not be mapped then.
+    /// Segments that other contexts passed and that could not be mapped yet.
     unmapped: Mutex<Vec<Unmapped>>,
-    /// What subscribers of this context ask for, and what its own publishers answered.
+    /// Pending requests of this context's subscribers, with the answers of its own publishers.
     own: Mutex<HashMap<Gid, OwnQuestion>>,
 }
 
 type Unmapped = (Weak<PeerSession>, SegmentOpened, PassedFd);
 
-/// A question of this context's.
+/// A pending request of a subscriber of this context.
 struct OwnQuestion {
     lane: Location,
     granted: Option<PublisherAnswer>,
 }
 
-/// That a subscriber asks, until it has its answer.
+/// Registers a subscriber's request until the answer arrives; dropping it removes the request.
 pub(crate) struct SubscriberQuestion<'a> {
     context: &'a Context,
     reader: Gid,
 }
 
 impl SubscriberQuestion<'_> {
-    /// The end that answered `granted` as this very context. Our id, memory and pidfd prove
-    /// nothing, as every peer has them: a publisher of ours must have granted just that.
+    /// Returns this context as the peer, for an answer `granted` that names this context. The context's id, memory and
+    /// pidfd prove nothing, because every peer has them. So a publisher of this context must have granted exactly this.
     pub(crate) fn answered(&self, granted: &PublisherAnswer) -> Result<RingPeer, ShmError> {
         match self.context.own()?.get(&self.reader) {
             Some(own) if own.granted.as_ref() == Some(granted) => Ok(self.context.local()),
@@ -93,7 +93,7 @@ impl Drop for SubscriberQuestion<'_> {
     }
 }
 
-/// Another context.
+/// Another context, which this one has mapped.
 struct MappedContext {
     session: Weak<PeerSession>,
     /// Device and inode of its first segment.
@@ -101,7 +101,7 @@ struct MappedContext {
 }
 
 impl Context {
-    /// A new context of this process.
+    /// Creates a context of this process.
     ///
     /// # Errors
     /// Memory or descriptors are short, or the system has no sealed memfds.
@@ -118,8 +118,8 @@ impl Context {
         Self { inner: Arc::new(ContextInner { session, entities, peers, lines, unmapped, own }) }
     }
 
-    /// Another context says over its own line that it has opened a segment or given one up. What
-    /// it says of others is not listened to.
+    /// Handles an update that another context sent over its own line: it opened or dropped a segment. Ignores updates
+    /// about segments of other contexts.
     pub(crate) fn hear(&self, from: &Arc<PeerSession>, news: SegmentUpdate) {
         let (SegmentUpdate::Opened(SegmentOpened { session, .. }, _)
         | SegmentUpdate::Gone(SegmentName { session, .. })) = &news;
@@ -129,12 +129,12 @@ impl Context {
         match news {
             SegmentUpdate::Opened(opened, fd) => match from.add_segment(opened.segment.into(), &fd)
             {
-                // One that is refused shows when it is read.
+                // A refused segment is reported when the reader needs it.
                 Ok(()) | Err(ShmError::Refused { .. }) => {}
                 Err(_) => {
                     let mut unmapped = self.unmapped();
                     let of = |other: &&Unmapped| other.0.as_ptr() == Arc::as_ptr(from);
-                    // Each of its lines tells of it.
+                    // The other context announces it on each of its lines.
                     let known = unmapped.iter().filter(of).any(|(_, other, _)| *other == opened);
                     if !known && unmapped.iter().filter(of).count() < MAX_KEPT_SEGMENTS {
                         unmapped.push((Arc::downgrade(from), opened, fd));
@@ -150,9 +150,9 @@ impl Context {
         }
     }
 
-    /// Maps what could not be mapped when it came, if it can be now.
+    /// Maps segments that could not be mapped when they arrived, if that is possible now.
     pub(crate) fn hear_again(&self) {
-        // Under the lock: one that is given up meanwhile is found here, or mapped already.
+        // The lock is held: a segment that is dropped meanwhile is either found in this list or already mapped.
         self.unmapped().retain(|(from, opened, fd)| {
             let mapped = |from: Arc<PeerSession>| from.add_segment(opened.segment.into(), fd);
             !matches!(
@@ -170,26 +170,26 @@ impl Context {
         &self.inner.lines
     }
 
-    /// Its id.
+    /// Returns the context's id.
     #[inline]
     pub fn id(&self) -> SessionId {
         self.session().id()
     }
 
-    /// Blocks until `ready`, which is asked again whenever something was published to a subscriber
-    /// of this context or [`notify`](Self::notify) was called, or until `timeout` has passed.
-    /// Returns what `ready` said last.
+    /// Blocks until `ready` returns true or until `timeout` has passed. `ready` is called again whenever a sample was
+    /// published to a subscriber of this context or [`notify`](Self::notify) was called. Returns the last result of
+    /// `ready`.
     pub fn wait(&self, ready: impl FnMut() -> bool, timeout: Option<Duration>) -> bool {
         self.session().wait(ready, timeout)
     }
 
-    /// Makes every [`wait`](Self::wait) look again.
+    /// Makes every [`wait`](Self::wait) call its `ready` again.
     pub fn notify(&self) {
         self.session().notify();
     }
 
-    /// A descriptor for an event loop, asynchronous ones too, which becomes readable when there is
-    /// something to look for. How to use it, with an example: [`ExternalLeader`].
+    /// Returns a descriptor for an event loop, also an asynchronous one. It becomes readable when subscribers should be
+    /// checked. [`ExternalLeader`] describes its use, with an example.
     ///
     /// # Errors
     /// The context has one already.
@@ -206,7 +206,7 @@ impl Context {
         Gid::new(self.id(), self.inner.entities.fetch_add(1, Ordering::Relaxed))
     }
 
-    /// A subscriber of this context is about to ask with `lane`.
+    /// Registers that a subscriber of this context is about to send a request with `lane`.
     pub(crate) fn asking(
         &self,
         reader: Gid,
@@ -216,7 +216,7 @@ impl Context {
         Ok(SubscriberQuestion { context: self, reader })
     }
 
-    /// This very context, if it has asked so.
+    /// Returns this context as the peer, if a subscriber of it has sent this request.
     pub(crate) fn asked_itself(&self, reader: Gid, lane: Location) -> Result<RingPeer, ShmError> {
         match self.own()?.get(&reader) {
             Some(own) if own.lane == lane => Ok(self.local()),
@@ -224,7 +224,7 @@ impl Context {
         }
     }
 
-    /// A publisher of this context answers a subscriber of it.
+    /// Registers the answer of a publisher of this context, if a subscriber of this context asked.
     pub(crate) fn granted_itself(&self, granted: &PublisherAnswer) -> Result<(), ShmError> {
         if let Some(own) = self.own()?.get_mut(&granted.reader) {
             own.granted = Some(*granted);
@@ -244,7 +244,7 @@ impl Context {
         Ok(self.inner.own.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
-    /// Another context, `id`, as seen from this one.
+    /// Returns another context `id`, and maps it if it is not mapped yet.
     pub(crate) fn peer(
         &self,
         id: SessionId,
@@ -271,8 +271,8 @@ impl Context {
         if let Some(known) = peers.get(&id)
             && let Some(session) = known.session.upgrade()
         {
-            // Ids are no secret. Without this check the owner of an id would get the session of a process
-            // that came with that id first.
+            // Ids are no secret. Without this check the owner of an id would get the session of another process that
+            // used the id first.
             if known.memory != memory || !session.is_of(process) {
                 return refuse("another process has this context's id");
             }

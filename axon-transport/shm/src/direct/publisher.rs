@@ -23,7 +23,7 @@ use crate::{
     writer::{Writer, loan::Loan},
 };
 
-/// What a [`Publisher`] is made for.
+/// Options of a [`Publisher`].
 ///
 /// ```
 /// use axon_shm::{PublisherOptions, qos::Qos};
@@ -41,39 +41,38 @@ pub struct PublisherOptions {
 }
 
 impl PublisherOptions {
-    /// A publisher that offers `qos`, keeps at most 64 MiB and publishes samples of up to 256 MiB.
-    /// Memory is taken as samples need it.
+    /// Returns options of a publisher that offers `qos`, keeps at most 64 MiB and publishes samples of up to 256 MiB.
+    /// Memory is allocated as samples need it.
     pub fn new(qos: Qos) -> Self {
         Self { qos, budget: 64 << 20, max_len: 256 << 20, expected_len: 0 }
     }
 
-    /// Bytes of samples to keep before the oldest go. One sample is always kept. Each counts
+    /// Sets the bytes of samples to keep before the oldest are dropped. One sample is always kept. Each sample counts
     /// as a multiple of 128 bytes.
     #[must_use]
     pub fn budget(self, budget: u64) -> Self {
         Self { budget, ..self }
     }
 
-    /// The largest sample in bytes.
+    /// Sets the largest sample in bytes.
     #[must_use]
     pub fn max_len(self, max_len: u64) -> Self {
         Self { max_len, ..self }
     }
 
-    /// The length of most samples in bytes. Where it is more than 512, the publisher has memory of
-    /// its own for samples from the start: subscribers get it when they connect, and [loans](Publisher::loan)
-    /// of more than 512 bytes are in place there, like all samples of more than 4 KiB. Otherwise only
-    /// the latter are, in memory that comes with the first of them.
+    /// Sets the length of most samples in bytes. If it is more than 512, the publisher has its own memory for samples
+    /// from the start, and subscribers get it when they connect. [Loans](Publisher::loan) of more than 512 bytes are
+    /// then in place there, like all samples of more than 4 KiB. Otherwise only samples of more than 4 KiB are, in
+    /// memory that is allocated with the first of them.
     #[must_use]
     pub fn expected_len(self, expected_len: u64) -> Self {
         Self { expected_len, ..self }
     }
 }
 
-/// Publishes samples to the subscribers that it [serves](Self::serve). All methods may be called
-/// from any thread, at the same time too. When it is dropped, subscribers still take what it left;
-/// the memory of that comes back as other publishers of the context [reclaim](Self::reclaim_idle) theirs, or
-/// with the context.
+/// Publishes samples to the subscribers that it [serves](Self::serve). All methods may be called from any thread, also
+/// concurrently. After it is dropped, subscribers can still take the samples that are left. The memory of those samples
+/// is freed when other publishers of the context [reclaim](Self::reclaim_idle) theirs, or with the context.
 ///
 /// ```
 /// # use std::{os::unix::net::UnixDatagram, thread, time::Duration};
@@ -100,10 +99,10 @@ pub struct Publisher {
 }
 
 impl Publisher {
-    /// A publisher without subscribers.
+    /// Creates a publisher without subscribers.
     ///
     /// # Errors
-    /// The options exceed what a ring may take, or memory or descriptors are short.
+    /// The options exceed the limits of a ring, or memory or descriptors are short.
     pub fn new(context: &Context, options: PublisherOptions) -> Result<Self, ShmError> {
         let PublisherOptions { qos, budget, max_len: max_message, expected_len: expected } =
             options;
@@ -113,22 +112,22 @@ impl Publisher {
         Ok(Self { context: context.clone(), qos, writer })
     }
 
-    /// Its GID.
+    /// Returns the publisher's GID.
     #[inline]
     pub fn gid(&self) -> Gid {
         self.writer.gid()
     }
 
-    /// Admits the one subscriber that [connects](crate::Subscriber::connect) at the other end of
-    /// `socket`, a connected unix socket that keeps packets apart (`SOCK_SEQPACKET` or
-    /// `SOCK_DGRAM`), and returns its GID. Waits for it for at most `timeout`.
+    /// Admits the one subscriber that [connects](crate::Subscriber::connect) at the other end of `socket`, and returns
+    /// its GID. `socket` is a connected unix socket that preserves packet boundaries (`SOCK_SEQPACKET` or
+    /// `SOCK_DGRAM`). Waits at most `timeout` for the subscriber.
     ///
-    /// The process at the other end is trusted to be the one that it claims to be. Memory that it
-    /// shares is not trusted. The socket is not needed any more afterwards.
+    /// The process at the other end is trusted to have the identity that it claims. The memory that it shares is not
+    /// trusted. The socket is not needed afterwards.
     ///
     /// # Errors
-    /// It did not ask in time, asked for what this publisher does not offer, or handed over what
-    /// cannot be used; it is told.
+    /// The subscriber did not ask in time, requested a QoS that this publisher does not offer, or passed something
+    /// unusable. If it asked, it is told the reason.
     pub fn serve(&self, socket: impl AsFd, timeout: Option<Duration>) -> Result<Gid, ConnectError> {
         let channel = ConnectChannel::new(socket.as_fd(), timeout);
         let (asked, descriptors, line) = channel.await_asked()?;
@@ -170,7 +169,7 @@ impl Publisher {
         Ok((granted, peer))
     }
 
-    /// Answers, and hands over the memory that is in use and, from then on, what comes into use.
+    /// Answers the subscriber, and passes it the memory in use now and any memory that comes into use later.
     fn answer(
         &self,
         channel: &ConnectChannel<'_>,
@@ -181,24 +180,24 @@ impl Publisher {
         let session = self.context.session();
         channel.grant(granted, &session.descriptors()?)?;
         match peer {
-            // It finds all of it here, and would take none of it from the line.
+            // A subscriber of this context has all the memory already and would never read the line.
             RingPeer::Local(_) => Ok(()),
             RingPeer::Remote(_) => self.context.lines().add(session, peer, granted, line),
         }
     }
 
-    /// Hands over what could not be handed over when it came into use.
+    /// Passes on segments that could not be passed on when they came into use.
     #[inline]
     fn keep_up(&self) {
         self.context.lines().keep_up(self.context.session());
     }
 
-    /// Publishes a sample, stamped with the current time, and returns its sequence number, which
-    /// counts from 1. Waits up to 100 ms where this publisher and a subscriber of another context
-    /// are both RELIABLE and KEEP_ALL and that one lags; never otherwise.
+    /// Publishes a sample, stamped with the current time, and returns its sequence number, which counts from 1. Waits
+    /// up to 100 ms if this publisher and a subscriber of another context are both RELIABLE and KEEP_ALL and that
+    /// subscriber lags. Never waits otherwise.
     ///
     /// # Errors
-    /// The sample was not published; what to do is in the error.
+    /// The sample was not published. The error says what to do.
     #[inline]
     pub fn publish(&self, payload: &[u8]) -> Result<u64, PublishError> {
         let published = self.writer.publish_next(wall(), payload);
@@ -206,10 +205,10 @@ impl Publisher {
         published
     }
 
-    /// As [`publish`](Self::publish), but never waits: [`PublishError::Blocked`] at once.
+    /// Like [`publish`](Self::publish), but never waits: returns [`PublishError::Blocked`] at once.
     ///
     /// # Errors
-    /// As for [`publish`](Self::publish).
+    /// The errors of [`publish`](Self::publish).
     #[inline]
     pub fn try_publish(&self, payload: &[u8]) -> Result<u64, PublishError> {
         let published = self.writer.try_publish_next(wall(), payload);
@@ -217,10 +216,10 @@ impl Publisher {
         published
     }
 
-    /// As [`publish`](Self::publish), with a number and a time of the caller's. Numbers must rise.
+    /// Like [`publish`](Self::publish), with the caller's number and time. Numbers must increase.
     ///
     /// # Errors
-    /// As for [`publish`](Self::publish).
+    /// The errors of [`publish`](Self::publish).
     #[inline]
     pub fn publish_with(&self, meta: Meta, payload: &[u8]) -> Result<(), PublishError> {
         let published = self.writer.publish(meta, payload);
@@ -228,9 +227,9 @@ impl Publisher {
         published.map(drop)
     }
 
-    /// If a sample would be read by nobody, now or later, uses up the next sequence number and
-    /// returns it; `None` when somebody would. Where nobody reads, publishing does the same, but
-    /// a caller that has to serialize first can save the work.
+    /// If no subscriber would read a sample, now or later, uses up the next sequence number and returns it. Returns
+    /// `None` if one would. Publishing does the same when nobody reads, but a caller that has to serialize first can
+    /// save that work.
     ///
     /// # Errors
     /// [`PublishError::Forked`].
@@ -238,23 +237,23 @@ impl Publisher {
         self.writer.skip_unread()
     }
 
-    /// Memory for a sample of `len` bytes, to be filled and then published: shared memory where it
-    /// is more than 4 KiB, or more than 512 bytes if [so many are
-    /// expected](PublisherOptions::expected_len), so that nothing is copied. It is aligned to 16.
+    /// Lends memory for a sample of `len` bytes, which the caller fills and then publishes. It is shared memory, so
+    /// nothing is copied, if `len` is more than 4 KiB, or more than 512 bytes if the publisher [expects so
+    /// many](PublisherOptions::expected_len). It is aligned to 16 bytes.
     ///
     /// # Errors
-    /// As for [`publish`](Self::publish).
+    /// The errors of [`publish`](Self::publish).
     #[inline]
     pub fn loan(&self, len: usize) -> Result<Loan<'_>, PublishError> {
         self.loan_behind(0, len)
     }
 
-    /// As [`loan`](Self::loan), but the byte behind the first `header` bytes is aligned to 16, not the
-    /// first byte. It is so for a reader that takes the sample in place, too. An example is a structure
-    /// that follows a header of four bytes.
+    /// Like [`loan`](Self::loan), but the byte after the first `header` bytes is aligned to 16 bytes, not the first
+    /// byte. The alignment also holds for a reader that takes the sample in place. An example is a structure that
+    /// follows a header of four bytes.
     ///
     /// # Errors
-    /// As for [`publish`](Self::publish).
+    /// The errors of [`publish`](Self::publish).
     #[inline]
     pub fn loan_behind(&self, header: usize, len: usize) -> Result<Loan<'_>, PublishError> {
         let loan = self.writer.loan_behind(header, len);
@@ -262,22 +261,22 @@ impl Publisher {
         loan
     }
 
-    /// Has memory ready for one more sample as long as the last that was in place, so that
-    /// publishing it waits for none. For a thread that has time between samples.
+    /// Allocates memory for one more sample of the length of the last in-place sample, so that publishing it does not
+    /// wait for memory. For a thread that has time between samples.
     ///
     /// # Errors
-    /// There is no memory, or the process forked.
+    /// Memory is short, or the process forked.
     pub fn prepare(&self) -> Result<(), ShmError> {
         let prepared = self.writer.prepare();
         self.keep_up();
         prepared
     }
 
-    /// Gives memory back that samples in place took and that is not needed any more: all
-    /// of it ten seconds after the last that anybody wants, else the part above four times what
-    /// was needed for as long. And hands over what a subscriber had no room for when it came into use,
-    /// which the last sample before a pause may be in. To be called about once a second for as long as
-    /// it returns true, and after the last sample before a pause.
+    /// Frees memory of in-place samples that is no longer needed. All of it is freed if no sample is kept there and
+    /// none came for ten seconds. Otherwise it is freed once it is more than four times what was needed in those ten
+    /// seconds, and samples move to new memory. Also passes on segments that could not be passed on when they came into
+    /// use; the last sample before a pause may be in one of them. Call this about once a second as long as it returns
+    /// true, and after the last sample before a pause.
     pub fn reclaim_idle(&self) -> bool {
         let more = self.writer.reclaim_idle(Instant::now());
         let more = self.context.session().tidy() || more;
@@ -285,13 +284,13 @@ impl Publisher {
         more
     }
 
-    /// The subscribers that it serves, among them such as have left since; see
+    /// Returns the subscribers that it serves. They may include subscribers that have left since; see
     /// [`reap`](Self::reap).
     pub fn subscribers(&self) -> Vec<Gid> {
         self.writer.readers()
     }
 
-    /// Forgets a subscriber; false when it was not served. Samples that it keeps it may keep.
+    /// Forgets a subscriber. Returns false if it was not served. The subscriber may keep the samples that it has.
     pub fn dismiss(&self, subscriber: Gid) -> bool {
         let served = self.writer.detach(subscriber);
         if !self.context.session().is_forked() {
@@ -300,8 +299,8 @@ impl Publisher {
         served
     }
 
-    /// Forgets the subscribers that have left or whose process has ended, and names them. Their
-    /// memory comes back with the next samples.
+    /// Forgets the subscribers that have left or whose process has ended, and returns their GIDs. Their memory is
+    /// reused for the next samples.
     pub fn reap(&self) -> Vec<Gid> {
         let gone = self.writer.drop_gone();
         gone.iter().for_each(|gid| self.context.lines().forget(*gid));

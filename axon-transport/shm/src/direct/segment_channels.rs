@@ -22,17 +22,17 @@ use crate::{
     wake::Purpose,
 };
 
-/// What may stand in a line: some twenty packets. Each segment among them keeps its memory, though
-/// its publisher may have given it up since.
+/// Send buffer of a line in bytes: about twenty packets. Each segment in a packet keeps its memory, although its
+/// publisher may have dropped it since.
 const QUEUE_BYTES: usize = 8 << 10;
-/// How often those that could not be told of something are tried again, at most.
+/// Minimum time between two retries on lines that are behind.
 const RETRY_INTERVAL: Duration = Duration::from_millis(10);
 
-/// All of a context's lines.
+/// All lines of a context.
 pub(crate) struct SegmentChannels {
     session: SessionId,
     state: Mutex<ChannelsState>,
-    /// Somebody has not been told all. A hint: what it is about is under the locks.
+    /// True if a line has not been told everything. A hint; the state itself is protected by the locks.
     behind: AtomicBool,
 }
 
@@ -43,20 +43,20 @@ struct ChannelsState {
     tried: Option<Instant>,
 }
 
-/// The channel over which one subscriber is told of segments.
+/// The channel over which one subscriber is told about segments.
 struct SegmentChannel {
     reader: Gid,
     writer: Gid,
     peer: RingPeer,
     socket: PassedFd,
-    /// The segments that its context was given, and that this line has to tell when they are gone.
+    /// The segments that this line has announced and still has to withdraw when they are dropped.
     told: Vec<SegmentInfo>,
-    /// Nothing more is published to it.
+    /// True if no new samples reach the subscriber over this channel.
     ended: bool,
 }
 
 impl SegmentChannel {
-    /// Whether what is in the segment may concern the subscriber.
+    /// Returns whether the subscriber may need the segment.
     fn reads(&self, kind: SegmentKind) -> bool {
         match kind {
             SegmentKind::Session => false,
@@ -106,7 +106,7 @@ impl SegmentChannel {
         self.told.iter().filter(|told| matches!(told.kind, SegmentKind::Samples(_)))
     }
 
-    /// The channel, whose sends do not block.
+    /// Returns the channel; its sends do not block.
     fn channel(&self) -> ConnectChannel<'_> {
         ConnectChannel::new(self.socket.as_fd(), Some(Duration::ZERO))
     }
@@ -123,14 +123,15 @@ impl ChannelsState {
         let parted = self.lines.extract_if(.., |line| match tell(line) {
             Ok(()) => line.ended && line.samples().next().is_none(),
             Err(ConnectError::Closed) => true,
-            // Its queue is full, or descriptors are short: that passes.
+            // The queue is full or descriptors are short. That is temporary.
             Err(_) => {
                 all = false;
                 false
             }
         });
         for parted in parted.collect::<Vec<_>>() {
-            // The context that it led to may go on, and have the segments mapped.
+            // The context at the other end may live on with these segments mapped, so another line to it has to
+            // withdraw them.
             let same = |line: &&mut SegmentChannel| line.peer.id() == parted.peer.id();
             let Some(heir) = self.lines.iter_mut().find(same) else { continue };
             for info in parted
@@ -152,8 +153,8 @@ impl SegmentChannels {
         Self { session, state: Mutex::default(), behind: AtomicBool::new(false) }
     }
 
-    /// From now on a subscriber of session `peer` is told over `socket` of the segments that there
-    /// are, the one that its ring is in first, and of those to come.
+    /// Adds a line: a subscriber of session `peer` is told over `socket` about the existing segments and about new
+    /// ones. The segment with its ring comes first.
     pub(crate) fn add(
         &self,
         session: &SessionSegment,
@@ -162,7 +163,7 @@ impl SegmentChannels {
         socket: PassedFd,
     ) -> Result<(), ConnectError> {
         let PublisherAnswer { reader, writer, ring, .. } = *granted;
-        // One that cannot be set holds more, which is its own harm.
+        // If the size cannot be set, the socket buffers more. That costs only memory.
         let _ = sockopt::set_socket_send_buffer_size(&socket, QUEUE_BYTES);
         let mut line =
             SegmentChannel { reader, writer, peer, socket, told: Vec::new(), ended: false };
@@ -174,13 +175,13 @@ impl SegmentChannels {
             Err(error) if !has_ring || matches!(error, ConnectError::Closed) => return Err(error),
             told => self.note(told.is_ok()),
         }
-        // A pair that asks again is told over its new line only.
+        // If the same pair connects again, only its new line is told.
         state.lines.retain(|line| (line.reader, line.writer) != (reader, writer));
         state.lines.push(line);
         Ok(())
     }
 
-    /// To be told of all segments. Called with their table locked, so it waits for nothing.
+    /// Handles an event about a segment. The caller holds the lock of the segments' table, so this does not block.
     pub(crate) fn tell(&self, event: SegmentEvent<'_>) {
         let mut state = match self.state.try_lock() {
             Ok(state) => state,
@@ -194,7 +195,7 @@ impl SegmentChannels {
         self.note(state.each(|line| match event {
             SegmentEvent::Opened(info, fd) => line.open(self.session, info, fd),
             SegmentEvent::Gone(info) => line.close(self.session, info),
-            // Nobody prepares publishers here but their owner.
+            // Only their owner prepares the publishers here.
             SegmentEvent::Low(_) => Ok(()),
         }));
     }
@@ -205,8 +206,8 @@ impl SegmentChannels {
         }
     }
 
-    /// Tells those that are behind what they lack, if anybody is and not all the time. Does not
-    /// wait for another thread that is telling them: the next call does the rest then.
+    /// Tells the lines that are behind what they miss, at most once per [`RETRY_INTERVAL`]. Does not wait for another
+    /// thread that is doing so; the next call does the rest then.
     #[inline]
     pub(crate) fn keep_up(&self, session: &SessionSegment) {
         if self.behind.load(Ordering::Relaxed) && !session.is_forked() {
@@ -218,7 +219,8 @@ impl SegmentChannels {
         }
     }
 
-    /// The same at once, for a caller that may be the last.
+    /// Like [`keep_up`](Self::keep_up), but always at once and waiting for the lock: the caller's next call may never
+    /// come.
     pub(crate) fn keep_up_now(&self, session: &SessionSegment) {
         if self.behind.load(Ordering::Relaxed) && !session.is_forked() {
             self.catch_up(self.lock(), session);
@@ -234,12 +236,12 @@ impl SegmentChannels {
 
     fn catch_up(&self, mut state: MutexGuard<'_, ChannelsState>, session: &SessionSegment) {
         state.tried = Some(Instant::now());
-        // Before the looks at what there is. What comes after such a look finds the lock taken, and
-        // by the lock of the segments' table stores its `true` after this.
+        // Stored before the tables are read. A segment that comes after a read finds the lock taken and stores `true`;
+        // the lock of the segments' table orders that store after this one.
         self.behind.store(false, Ordering::Relaxed);
         self.note(state.each(|line| {
             let told = line.catch_up(session, 0);
-            // It may sleep over what it lacked.
+            // The subscriber may be asleep, waiting for the segment that it misses.
             line.peer.ring_if(Purpose::Samples);
             told
         }));
@@ -253,7 +255,8 @@ impl SegmentChannels {
         self.note(told);
     }
 
-    /// Stops new samples to a subscriber, or of a publisher. Published samples stay readable.
+    /// Marks the channels of a subscriber, or of a publisher, as ended: they announce no new segments. Published
+    /// samples stay readable.
     pub(crate) fn end(&self, gid: Gid) {
         let told = self.lock().each(|line| {
             line.ended |= line.reader == gid || line.writer == gid;

@@ -23,12 +23,12 @@ use crate::{
     session::peer::{PeerSession, RingPeer},
 };
 
-/// No sleep is longer: what a publisher stored last and did not live to ring for is found then.
+/// The longest sleep. A publisher may store a sample and die before it rings the doorbell; the sample is found then.
 const LONGEST_SLEEP: Duration = Duration::from_secs(1);
-/// Updates that one look reads at most. A socket holds fewer, unless the other end fills it all the time.
+/// Most updates that one call reads. A socket holds fewer, unless the other end fills it all the time.
 const MAX_UPDATES: u32 = 64;
 
-/// What a [`Subscriber`] asks for.
+/// Options of a [`Subscriber`].
 ///
 /// ```
 /// use axon_shm::{SubscriberOptions, qos::Qos};
@@ -43,22 +43,22 @@ pub struct SubscriberOptions {
 }
 
 impl SubscriberOptions {
-    /// A subscriber that requests `qos` and takes samples of up to 256 MiB.
+    /// Returns options of a subscriber that requests `qos` and takes samples of up to 256 MiB.
     pub fn new(qos: Qos) -> Self {
         Self { qos, max_len: 256 << 20 }
     }
 
-    /// The largest sample in bytes. Longer ones count as lost.
+    /// Sets the largest sample in bytes. Longer samples count as lost.
     #[must_use]
     pub fn max_len(self, max_len: u64) -> Self {
         Self { max_len, ..self }
     }
 }
 
-/// Takes the samples of one publisher. Goes on after that one's end until nothing is left.
+/// Takes the samples of one publisher. After the publisher's end it takes the samples that are left.
 ///
-/// It may be moved to another thread, and taking is for one thread at a time; the samples that were
-/// taken are no part of it, so they may go anywhere and outlive it.
+/// A subscriber may be moved to another thread, but only one thread at a time can take. Samples that were taken are
+/// independent of it: they may be sent to any thread and outlive it.
 ///
 /// ```
 /// # use axon_shm::{Context, Publisher, Sample, Subscriber};
@@ -85,18 +85,18 @@ impl SubscriberOptions {
 /// }
 /// ```
 ///
-/// Three ways to wait: [`recv`](Self::recv) blocks; [`Context::wait`] blocks on any number of
-/// subscribers; [`Context::event`] has a descriptor for an event loop, such as that of tokio.
+/// There are three ways to wait: [`recv`](Self::recv) blocks; [`Context::wait`] blocks on any number of subscribers;
+/// [`Context::event`] returns a descriptor for an event loop, for example tokio's.
 pub struct Subscriber {
     context: Context,
     reader: Reader,
     gid: Gid,
-    /// Over which memory of the publisher's comes that is in use only later; absent where the
-    /// publisher is in the same context.
+    /// The socket over which the publisher passes memory that comes into use later. `None` if the publisher is in the
+    /// same context.
     line: Option<Mutex<PassedFd>>,
-    /// Keeps the publisher's memory, where that is in another context.
+    /// Keeps the publisher's memory mapped, if the publisher is in another context.
     _hold: Option<Hold>,
-    /// When the line was read last.
+    /// When `recv` last read the line.
     tended: Instant,
 }
 
@@ -124,11 +124,11 @@ impl Drop for Hold {
 }
 
 impl Subscriber {
-    /// Asks the publisher that [serves](crate::Publisher::serve) at the other end of `socket`, and
-    /// waits for its answer for at most `timeout`. The socket is not needed any more after it.
+    /// Sends a request to the publisher that [serves](crate::Publisher::serve) at the other end of `socket`, and waits
+    /// at most `timeout` for its answer. The socket is not needed afterwards.
     ///
     /// # Errors
-    /// It did not answer in time, refused, or handed over what cannot be used.
+    /// The publisher did not answer in time, refused, or passed something unusable.
     pub fn connect(
         context: &Context,
         socket: impl AsFd,
@@ -158,11 +158,11 @@ impl Subscriber {
             hold = Some(Hold::new(context, peer, granted.writer));
             let left = timeout.map(|timeout| timeout.saturating_sub(start.elapsed()));
             let channel = ConnectChannel::new(ours.as_fd(), left);
-            // A ring that is not in the first segment: its own follows.
+            // The ring is not in the first segment: the publisher sends its segment over the line.
             while !peer.has_segment(ring.segment) {
                 context.hear(peer, channel.take_update()?);
             }
-            // The process at the other end decides what is queued in it, and so how long closing it takes.
+            // The process at the other end decides what is queued in the socket, and so how long closing it takes.
             kept = Some(Mutex::new(PassedFd::received(ours)));
         }
         let reader = Reader::map(ReaderOptions {
@@ -179,23 +179,23 @@ impl Subscriber {
         Ok(Self { context, reader, gid, line: kept, _hold: hold, tended })
     }
 
-    /// Its GID.
+    /// Returns the subscriber's GID.
     #[inline]
     pub fn gid(&self) -> Gid {
         self.gid
     }
 
-    /// The publisher's GID.
+    /// Returns the publisher's GID.
     #[inline]
     pub fn publisher(&self) -> Gid {
         self.reader.writer()
     }
 
-    /// The next sample, or `None` when there is none. Never waits. One of more than 4 KiB, or a loan of
-    /// more than 512 bytes if its publisher [expects](crate::PublisherOptions::expected_len) such,
-    /// stays in the publisher's memory for as long as it is kept.
+    /// Returns the next sample, or `None` if there is none. Never waits. A sample of more than 4 KiB stays in the
+    /// publisher's memory as long as it is kept. So does a loan of more than 512 bytes if its publisher
+    /// [expects](crate::PublisherOptions::expected_len) such samples.
     ///
-    /// Where more is unread than the requested depth, the oldest are [skipped](Self::skipped).
+    /// If more samples are unread than the requested depth, the oldest are [skipped](Self::skipped).
     ///
     /// # Errors
     /// See [`TakeError`]. After [`TakeError::Corrupt`] there will be no more samples.
@@ -204,11 +204,10 @@ impl Subscriber {
         self.take_with(Reader::take_sample)
     }
 
-    /// As [`take`](Self::take), but into `out`, which it replaces: without an allocation where
-    /// `out` is large enough.
+    /// Like [`take`](Self::take), but replaces the contents of `out`. It does not allocate if `out` is large enough.
     ///
     /// # Errors
-    /// As for [`take`](Self::take).
+    /// The errors of [`take`](Self::take).
     pub fn take_into(&mut self, out: &mut Vec<u8>) -> Result<Option<Meta>, TakeError> {
         Ok(self.take_with(|reader| reader.take(out))?.map(|taken| taken.meta))
     }
@@ -225,12 +224,12 @@ impl Subscriber {
         take(&mut self.reader)
     }
 
-    /// Takes in what the publisher said of its memory.
+    /// Handles the updates that the publisher sent about its memory.
     fn hear(&self) {
         let (Some(line), Some(publisher)) = (&self.line, self.reader.peer().remote()) else {
             return;
         };
-        // What a child takes its parent never hears.
+        // An update that a forked child receives is lost to the parent.
         if self.context.session().is_forked() {
             return;
         }
@@ -238,28 +237,28 @@ impl Subscriber {
         for _ in 0..MAX_UPDATES {
             match ConnectChannel::new(line.as_fd(), Some(Duration::ZERO)).take_update() {
                 Ok(news) => self.context.hear(publisher, news),
-                // What finds no room here is there the next time, too.
+                // An update that finds no room here stays in the socket until the next call.
                 Err(_) => break,
             }
         }
         self.context.hear_again();
     }
 
-    /// Lets go of memory that the publisher gave up. To be called about once a second where samples
-    /// in place are taken now and then; [`recv`](Self::recv) does it while it waits.
+    /// Unmaps memory that the publisher dropped. Call this about once a second if in-place samples are taken only now
+    /// and then. [`recv`](Self::recv) does it while it waits.
     pub fn reclaim_idle(&self) {
         self.hear();
     }
 
-    /// As [`take`](Self::take), after waiting for a sample for at most `timeout`. `None` also when
-    /// the publisher's process has ended and nothing of it is left.
+    /// Like [`take`](Self::take), but waits at most `timeout` for a sample. Also returns `None` if the publisher's
+    /// process has ended and no sample of it is left.
     ///
     /// # Errors
-    /// As for [`take`](Self::take).
+    /// The errors of [`take`](Self::take).
     pub fn recv(&mut self, timeout: Option<Duration>) -> Result<Option<Sample>, TakeError> {
         let deadline = timeout.and_then(|timeout| Instant::now().checked_add(timeout));
         loop {
-            // Not only once there is nothing to take, which may never be.
+            // Also checked while there are samples to take, because the subscriber may never run out of them.
             if self.line.is_some() && self.tended.elapsed() >= LONGEST_SLEEP {
                 self.tended = Instant::now();
                 self.reclaim_idle();
@@ -270,7 +269,7 @@ impl Subscriber {
             let left = deadline.map_or(LONGEST_SLEEP, |deadline| {
                 deadline.saturating_duration_since(Instant::now()).min(LONGEST_SLEEP)
             });
-            // In this order: what it published before it ended is seen by the look.
+            // In this order: the check for samples then sees what the publisher published before it ended.
             if left.is_zero() || (self.publisher_ended() && self.reader.is_drained()) {
                 return Ok(None);
             }
@@ -280,8 +279,8 @@ impl Subscriber {
         }
     }
 
-    /// Whether there is something to take: two loads, and a system call only while memory of the
-    /// publisher's is missing. For [`Context::wait`] and event loops.
+    /// Returns whether there is something to take. Costs two loads, and a system call only while a segment of the
+    /// publisher is missing. For [`Context::wait`] and event loops.
     #[inline]
     pub fn has_data(&self) -> bool {
         if self.reader.has_data() {
@@ -294,25 +293,26 @@ impl Subscriber {
         }
     }
 
-    /// Samples taken.
+    /// Returns the number of samples taken.
     #[inline]
     pub fn received(&self) -> u64 {
         self.reader.received()
     }
 
-    /// Samples overwritten before they could be taken, within the requested depth.
+    /// Returns the number of samples that were overwritten before they could be taken, within the requested depth.
     #[inline]
     pub fn lost(&self) -> u64 {
         self.reader.lost()
     }
 
-    /// Samples passed over because more recent ones fill the requested depth.
+    /// Returns the number of samples that were passed over because newer ones fill the requested depth.
     #[inline]
     pub fn skipped(&self) -> u64 {
         self.reader.skipped()
     }
 
-    /// Whether the publisher's process has ended: a system call. What it left can be taken still.
+    /// Returns whether the publisher's process has ended, by a system call. The samples that it left can still be
+    /// taken.
     pub fn publisher_ended(&self) -> bool {
         self.reader.writer_dead()
     }
@@ -320,8 +320,8 @@ impl Subscriber {
 
 impl Drop for Subscriber {
     fn drop(&mut self) {
-        // The publisher hears at once that nobody listens, so that what it says is not lost. A
-        // forked child's end of the line is its parent's, too.
+        // The publisher learns at once that nobody listens, so it hands its pending updates to another line. A forked
+        // child shares its end of the line with its parent.
         if let (Some(line), false) = (&mut self.line, self.context.session().is_forked()) {
             let line = line.get_mut().unwrap_or_else(PoisonError::into_inner);
             let _ = shutdown(&*line, Shutdown::Both);

@@ -7,10 +7,10 @@ use std::{fs::File, io::Read as _, path::Path};
 
 use crate::error::ShmError;
 
-/// Left free for everybody else.
+/// Bytes that are left free for other processes.
 const RESERVE: u64 = 8 << 20;
 
-/// Whether `needed` bytes more can be taken without starving the host or the control group.
+/// Checks that `needed` bytes can be allocated without exhausting the memory of the host or the control group.
 pub(crate) fn check(needed: u64) -> Result<(), ShmError> {
     let enough = needed.saturating_add(RESERVE);
     match at_most(enough) {
@@ -21,16 +21,16 @@ pub(crate) fn check(needed: u64) -> Result<(), ShmError> {
 
 #[cfg(test)]
 thread_local! {
-    /// What a test has this thread believe to be available.
+    /// The available memory that a test makes this thread believe in.
     pub(crate) static PRETENDED: std::cell::Cell<Option<u64>> = const { std::cell::Cell::new(None) };
 }
 
-/// Bytes available to this process, or `None` where the system does not tell.
+/// Returns the bytes available to this process; `None` if the system does not tell.
 pub(crate) fn bytes() -> Option<u64> {
     at_most(u64::MAX)
 }
 
-/// The same, though whether it is more than `enough` is not looked at closely.
+/// Like [`bytes`], but the result may be too low if it is at least `enough`.
 fn at_most(enough: u64) -> Option<u64> {
     #[cfg(test)]
     if let Some(pretended) = PRETENDED.get() {
@@ -78,7 +78,7 @@ const V1: MemoryFiles = MemoryFiles {
     reclaimable: "total_inactive_file ",
 };
 
-/// The memory left to a group and its ancestors, by the tightest of their limits.
+/// Returns the least memory left to a group and its ancestors by their limits.
 fn lowest(
     root: &Path,
     group: &str,
@@ -92,12 +92,12 @@ fn lowest(
 
 fn room(directory: &Path, files: &MemoryFiles, enough: u64, text: &mut String) -> Option<u64> {
     let mut number = |name| read(&directory.join(name), text)?.trim_ascii().parse::<u64>().ok();
-    // A group without a limit says "max", which is no number.
+    // A group without a limit says "max", which does not parse as a number.
     let limit = number(files.limit)?;
     let usage = number(files.usage)?;
     let left = limit.saturating_sub(usage);
     if left >= enough {
-        // The kernel adds up all processors' counters for what follows.
+        // Reading memory.stat makes the kernel add up the counters of all processors.
         return Some(left);
     }
     let reclaimable = read(&directory.join("memory.stat"), text)
@@ -106,14 +106,14 @@ fn room(directory: &Path, files: &MemoryFiles, enough: u64, text: &mut String) -
     Some(limit.saturating_sub(usage.saturating_sub(reclaimable)))
 }
 
-/// Reads a file of the kernel's, which gives no length beforehand, into `text`.
+/// Reads a file of the kernel, whose length is not known beforehand, into `text`.
 fn read<'a>(path: &Path, text: &'a mut String) -> Option<&'a str> {
     text.clear();
     File::open(path).ok()?.read_to_string(text).ok()?;
     Some(text)
 }
 
-/// The number after `name` at the start of a line.
+/// Returns the number after `name` at the start of a line.
 fn field(text: &str, name: &str) -> Option<u64> {
     let starts_line = |at: usize| at == 0 || text.as_bytes()[at - 1] == b'\n';
     let (at, _) = text.match_indices(name).find(|(at, _)| starts_line(*at))?;

@@ -12,21 +12,21 @@ use std::{
     sync::atomic::{AtomicU64, Ordering},
 };
 
-/// From here on words are slow: each is a load of its own to the compiler.
+/// From this length on, copies by words are slow: the compiler emits a load for each word.
 #[cfg(all(target_arch = "x86_64", not(miri)))]
 const BULK: usize = 1024;
 
-/// Up to here, about a core's own cache, the processor's own copy is the fastest. Of what is longer and
-/// lies in another core's cache it fetches little ahead, and at times takes twice as long as a loop does.
+/// Up to this length, about a core's own cache, the processor's own copy instruction is the fastest. For longer data in
+/// another core's cache it prefetches little, and at times takes twice as long as a loop.
 #[cfg(all(target_arch = "x86_64", not(miri)))]
 const CACHED: usize = 512 << 10;
 
-/// Fills `out` with the bytes from `at` on.
+/// Fills `out` with the bytes from offset `at` on.
 ///
 /// # Panics
-/// The words have fewer.
+/// The words have fewer bytes.
 pub(crate) fn read_at(words: &[AtomicU64], at: usize, out: &mut [u8]) {
-    // SAFETY: the same bytes, and nothing that is not a byte is written to them.
+    // SAFETY: both slices are the same bytes, and `copy` writes only initialized bytes to them.
     let out = unsafe { &mut *(std::ptr::from_mut(out) as *mut [MaybeUninit<u8>]) };
     copy(words, at, out);
 }
@@ -34,10 +34,10 @@ pub(crate) fn read_at(words: &[AtomicU64], at: usize, out: &mut [u8]) {
 /// Replaces `out` by the `len` bytes of `words` from `at` on.
 ///
 /// # Errors
-/// Memory for them is not to be had.
+/// There is no memory for the bytes.
 ///
 /// # Panics
-/// The words have fewer.
+/// The words have fewer bytes.
 pub(crate) fn copy_out(
     words: &[AtomicU64],
     at: usize,
@@ -51,10 +51,10 @@ pub(crate) fn copy_out(
 /// Adds the `len` bytes of `words` from `at` on to `out`.
 ///
 /// # Errors
-/// Memory for them is not to be had.
+/// There is no memory for the bytes.
 ///
 /// # Panics
-/// The words have fewer.
+/// The words have fewer bytes.
 pub(crate) fn append(
     words: &[AtomicU64],
     at: usize,
@@ -63,15 +63,15 @@ pub(crate) fn append(
 ) -> Result<(), TryReserveError> {
     out.try_reserve(len)?;
     copy(words, at, &mut out.spare_capacity_mut()[..len]);
-    // SAFETY: within the reserved capacity, and `copy` wrote each of the `len` bytes behind those that there were.
+    // SAFETY: within the reserved capacity, and `copy` wrote each of the `len` bytes after the existing ones.
     unsafe { out.set_len(out.len() + len) };
     Ok(())
 }
 
-/// Writes the bytes from `at` on to all of `out`.
+/// Fills `out` with the bytes from offset `at` on.
 ///
 /// # Panics
-/// The words have fewer.
+/// The words have fewer bytes.
 #[inline]
 pub(crate) fn copy(words: &[AtomicU64], at: usize, out: &mut [MaybeUninit<u8>]) {
     assert!(at.checked_add(out.len()).is_some_and(|end| end <= words.len() * 8));
@@ -79,7 +79,7 @@ pub(crate) fn copy(words: &[AtomicU64], at: usize, out: &mut [MaybeUninit<u8>]) 
     if out.len() >= BULK {
         let from = words.as_ptr().cast::<u8>().wrapping_add(at);
         let (lines, rest) = out.split_at_mut(if out.len() > CACHED { out.len() & !63 } else { 0 });
-        // SAFETY: the words hold as many bytes from `at` on, as was just checked.
+        // SAFETY: the words hold `out.len()` bytes from `at` on, as was just checked.
         unsafe { copy_lines(from, lines) };
         // SAFETY: as above; the rest begins where the lines end.
         return unsafe { copy_bulk(from.wrapping_add(lines.len()), rest) };
@@ -106,7 +106,7 @@ fn copy_words(words: &[AtomicU64], at: usize, out: &mut [MaybeUninit<u8>]) {
     }
 }
 
-/// Fills `to` with the first of `bytes`, which are enough.
+/// Fills `to` with the first of `bytes`. There must be at least as many.
 #[inline(always)]
 fn put(to: &mut [MaybeUninit<u8>], bytes: &[u8]) {
     debug_assert!(bytes.len() >= to.len());
@@ -115,18 +115,19 @@ fn put(to: &mut [MaybeUninit<u8>], bytes: &[u8]) {
     }
 }
 
+/// Copies with `rep movsb`.
+///
 /// # Safety
-/// As many bytes from `from` on as `out` has are words of a map. Other processes may write to them.
+/// The `out.len()` bytes from `from` on must be words of a map. Other processes may write to them.
 #[cfg(all(target_arch = "x86_64", not(miri)))]
 #[inline]
 unsafe fn copy_bulk(from: *const u8, out: &mut [MaybeUninit<u8>]) {
-    // SAFETY: it reads what the caller promises, which is mapped, and writes to `out` alone, which
-    // is ours. That others may write what is read is no data race of the language: to the compiler
-    // this block is one that it cannot look into and that may do to this memory what loads of words
-    // do, relaxed and each once; and it is just that. It does not count on what it reads. The
-    // direction flag is clear, as it always is on the way in, and no flag is changed. Loads of the
-    // processor stay in their order, so what is loaded after an acquire fence that follows
-    // comes later, as with words; string instructions are an exception only in what they store.
+    // SAFETY: the instruction reads bytes that the caller promises, which are mapped, and writes only to `out`, which
+    // is ours. Other processes may write to the bytes meanwhile. That is no data race of the language: to the compiler
+    // this block is opaque and may do to this memory what loads of words do, relaxed and each once; and it does just
+    // that. It does not rely on the values that it reads. The direction flag is clear on entry, as the ABI requires,
+    // and no flag is changed. The processor keeps its loads in order, so bytes that are loaded after a following
+    // acquire fence are loaded later, as with words; string instructions are an exception only for their stores.
     unsafe {
         std::arch::asm!(
             "rep movsb",
@@ -141,15 +142,14 @@ unsafe fn copy_bulk(from: *const u8, out: &mut [MaybeUninit<u8>]) {
 /// Copies 64 bytes at a time, in a loop that the processor fetches ahead of.
 ///
 /// # Safety
-/// As many bytes from `from` on as `out` has, a multiple of 64, are words of a map. Other processes may
-/// write to them.
+/// The `out.len()` bytes from `from` on, a multiple of 64, must be words of a map. Other processes may write to them.
 #[cfg(all(target_arch = "x86_64", not(miri)))]
 #[inline]
 unsafe fn copy_lines(from: *const u8, out: &mut [MaybeUninit<u8>]) {
     let end = from.wrapping_add(out.len());
-    // SAFETY: it reads from `from` up to `end`, which the caller promises, and writes as much to `out`,
-    // which is ours; neither where there is nothing to copy. Registers of 16 bytes are part of x86_64.
-    // What `copy_bulk` says of other writers and of order goes for these loads as well.
+    // SAFETY: the loop reads from `from` up to `end`, which the caller promises, and writes as many bytes to `out`,
+    // which is ours. It does neither if there is nothing to copy. Registers of 16 bytes are part of x86_64. The
+    // argument of `copy_bulk` about other writers and about order holds for these loads as well.
     unsafe {
         std::arch::asm!(
             "cmp {from}, {end}",
@@ -184,7 +184,7 @@ unsafe fn copy_lines(from: *const u8, out: &mut [MaybeUninit<u8>]) {
 mod tests {
     use super::*;
 
-    /// Words of which each byte is told from its neighbours.
+    /// Returns words in which each byte differs from its neighbours.
     fn words(bytes: usize) -> (Vec<AtomicU64>, Vec<u8>) {
         let bytes: Vec<u8> =
             (0..bytes.next_multiple_of(8)).map(|at| (at * 7 % 251) as u8).collect();

@@ -2,15 +2,14 @@
 
 #![allow(unsafe_code)]
 
-/// Has the cache line of `word` fetched, if it is not here, while the caller goes on. Only a hint:
-/// nothing is read as far as the program can tell, and where there is no such instruction it does
-/// nothing.
+/// Prefetches the cache line of `word` while the caller goes on. It is only a hint: to the program nothing is read. It
+/// does nothing on processors without such an instruction here.
 #[inline]
 pub(crate) fn prefetch<W>(word: &W) {
     let at = std::ptr::from_ref(word);
     #[cfg(all(target_arch = "x86_64", not(miri)))]
-    // SAFETY: the instruction neither faults nor changes anything, whatever the address; this one is
-    // of a reference.
+    // SAFETY: the instruction neither faults nor changes anything, whatever the address; this address comes from a
+    // reference.
     unsafe {
         use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
         _mm_prefetch::<_MM_HINT_T0>(at.cast());

@@ -18,10 +18,10 @@ use crate::error::ShmError;
 
 const LEN: u64 = 4096;
 
-/// Memory with nothing in it, for another process to try whether it can map this one's.
+/// Creates empty memory, with which another process finds out whether it can map memory of this one.
 ///
 /// # Errors
-/// There is none to be had.
+/// The system cannot create it.
 pub fn probe() -> Result<OwnedFd, ShmError> {
     let fd = memfd_create("axon-probe", MemfdFlags::CLOEXEC)
         .map_err(ShmError::system("creating a memfd"))?;
@@ -29,17 +29,16 @@ pub fn probe() -> Result<OwnedFd, ShmError> {
     Ok(fd)
 }
 
-/// Why the memory of another process is out of reach, if so. What else may be wrong with it is said
-/// by those who map it.
+/// Returns the error if a security policy keeps this process from mapping the memory of another. Ignores other errors:
+/// the code that maps segments reports them.
 pub fn out_of_reach(memory: impl AsFd) -> Option<std::io::Error> {
-    // SAFETY: a fresh mapping at an address of the kernel's choice aliases nothing, and nobody looks
-    // into it.
+    // SAFETY: a fresh mapping at an address of the kernel's choice aliases nothing, and nothing accesses it.
     let mapped = unsafe {
         mmap(ptr::null_mut(), LEN as usize, ProtFlags::READ, MapFlags::SHARED, memory, 0)
     };
     match mapped {
         Ok(base) => {
-            // SAFETY: the mapping just made, of which nothing is borrowed.
+            // SAFETY: the mapping just made; nothing borrows it.
             let _ = unsafe { munmap(base, LEN as usize) };
             None
         }

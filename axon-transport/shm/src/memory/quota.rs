@@ -8,34 +8,35 @@ use std::sync::{
 
 use crate::error::ShmError;
 
-/// Maps, and their bytes.
+/// A number of maps and their total bytes.
 #[derive(Clone, Copy, Debug)]
 struct Amount {
     maps: u64,
     bytes: u64,
 }
 
-/// Of one process: the memory of a thousand publishers of large samples as they usually are.
+/// The limit for one process: the memory of a thousand publishers of large samples with the usual options.
 const OF_PROCESS: Amount = Amount { maps: 1 << 10, bytes: 4 << 40 };
-/// Of all of them: a quarter of the maps that Linux gives to a process (vm.max_map_count), and of an
-/// address space of 47 bits.
+/// The limit for all processes: a quarter of the maps that Linux allows a process (vm.max_map_count), and of an address
+/// space of 47 bits.
 const OF_ALL: Amount = Amount { maps: 16 << 10, bytes: 32 << 40 };
 
-/// The bounds for all processes and for one, in an address space of `space` bytes. All get half of it at most, and one
-/// process a quarter of that. Some small machines have 39 bits, which are 512 GiB.
+/// Returns the limits for all processes and for one, in an address space of `space` bytes. All processes get at most
+/// half of it, and one process a quarter of that. Some small machines have 39 bits, which are 512 GiB.
 fn bounds(space: u64) -> (Amount, Amount) {
     let all = OF_ALL.bytes.min(space / 2);
     let process = OF_PROCESS.bytes.min(all / 4);
     (Amount { bytes: all, ..OF_ALL }, Amount { bytes: process, ..OF_PROCESS })
 }
 
-/// The address space of this process: stacks are in its upper half.
+/// Returns the size of this process's address space, from the address of a stack variable: stacks are in its upper
+/// half.
 fn space() -> u64 {
     let here = 0u8;
     (&raw const here as u64).next_power_of_two()
 }
 
-/// What may be mapped, and what is.
+/// A limit on maps, and the part that is taken.
 pub(crate) struct Quota {
     whose: &'static str,
     most: Amount,
@@ -43,7 +44,7 @@ pub(crate) struct Quota {
     bytes: AtomicU64,
 }
 
-/// What all others take of this process.
+/// The quota of all other processes together.
 static ALL: Quota = Quota::new("all other processes", OF_ALL);
 
 impl Quota {
@@ -51,12 +52,12 @@ impl Quota {
         Self { whose, most, maps: AtomicU64::new(0), bytes: AtomicU64::new(0) }
     }
 
-    /// For the memory of one process.
+    /// Creates the quota for the memory of one process.
     pub(crate) fn of_process() -> Arc<Self> {
         Arc::new(Self::new("another process", bounds(space()).1))
     }
 
-    /// A map of `bytes` bytes.
+    /// Takes one map of `bytes` bytes.
     pub(crate) fn take(self: &Arc<Self>, bytes: u64) -> Result<Share, ShmError> {
         self.reserve(bytes, self.most)?;
         if let Err(error) = ALL.reserve(bytes, bounds(space()).0) {
@@ -69,7 +70,7 @@ impl Quota {
     fn reserve(&self, bytes: u64, most: Amount) -> Result<(), ShmError> {
         let whose = self.whose;
         let full = || ShmError::AddressSpace { whose, maps: most.maps, bytes: most.bytes };
-        // Counters alone: nothing is reached by what they say.
+        // Relaxed: these are only counters, which guard no other memory.
         let add = |count: &AtomicU64, more: u64, most: u64| {
             let sum = |count: u64| count.checked_add(more).filter(|sum| *sum <= most);
             count.fetch_update(Ordering::Relaxed, Ordering::Relaxed, sum).map_err(|_| full())
@@ -87,7 +88,7 @@ impl Quota {
     }
 }
 
-/// What one map takes of it, until it is dropped.
+/// The share of one map, until it is dropped.
 pub(crate) struct Share {
     of: Arc<Quota>,
     bytes: u64,

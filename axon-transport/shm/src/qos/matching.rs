@@ -8,20 +8,21 @@ use super::{Choice, Durability, Liveliness, Qos, QosRequest, Reliability};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 #[non_exhaustive]
 pub enum Incompatible {
-    /// BEST_EFFORT offered, RELIABLE requested.
+    /// The publisher offers BEST_EFFORT, the subscription requests RELIABLE.
     Reliability,
-    /// VOLATILE offered, TRANSIENT_LOCAL requested.
+    /// The publisher offers VOLATILE, the subscription requests TRANSIENT_LOCAL.
     Durability,
-    /// A longer deadline offered than requested.
+    /// The offered deadline is longer than the requested one.
     Deadline,
-    /// AUTOMATIC offered, MANUAL_BY_TOPIC requested.
+    /// The publisher offers AUTOMATIC, the subscription requests MANUAL_BY_TOPIC.
     Liveliness,
-    /// A longer lease offered than requested.
+    /// The offered lease is longer than the requested one.
     LivelinessLease,
 }
 
 impl Incompatible {
-    /// Every policy that can keep two endpoints apart, in the order in which they are looked at.
+    /// Every policy that can make two endpoints incompatible, in the order in which they are
+    /// checked.
     pub const ALL: [Self; 5] = [
         Self::Reliability,
         Self::Durability,
@@ -30,7 +31,7 @@ impl Incompatible {
         Self::LivelinessLease,
     ];
 
-    /// What is offered and what was requested, for people.
+    /// Describes the offered and the requested value, for people.
     pub fn reason(self) -> &'static str {
         match self {
             Self::Reliability => "the publisher is BEST_EFFORT, the subscription wants RELIABLE",
@@ -60,15 +61,16 @@ impl fmt::Display for Incompatible {
     }
 }
 
-/// Whether a publisher that offers `offered` serves a subscription that requests `requested`.
+/// Checks whether a publisher that offers `offered` serves a subscription that requests
+/// `requested`.
 ///
 /// # Errors
-/// The first policy that does not go together.
+/// The first incompatible policy.
 pub fn compatible(offered: &Qos, requested: &Qos) -> Result<(), Incompatible> {
     incompatibilities(offered, requested).next().map_or(Ok(()), Err)
 }
 
-/// Every policy in which `offered` is less than `requested`.
+/// Returns every policy for which `offered` is less than `requested`.
 pub fn incompatibilities(offered: &Qos, requested: &Qos) -> impl Iterator<Item = Incompatible> {
     let (offered, requested) = (*offered, *requested);
     Incompatible::ALL.into_iter().filter(move |policy| match policy {
@@ -89,21 +91,22 @@ pub fn incompatibilities(offered: &Qos, requested: &Qos) -> impl Iterator<Item =
     })
 }
 
-/// Whether two profiles that nobody has resolved would go together.
+/// The compatibility of two profiles whose open policies have not been resolved.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Compatibility {
-    /// They would.
+    /// They are compatible, whatever the open policies become.
     Compatible,
-    /// That hangs on policies that are left open.
+    /// It depends on open policies; these may be incompatible.
     Unknown(Vec<Incompatible>),
-    /// They would not, whatever is left open.
+    /// They are incompatible in these policies, whatever the open policies become.
     Incompatible(Vec<Incompatible>),
 }
 
-/// Whether two profiles would go together, where some policies may be left open.
+/// Checks whether two profiles are compatible. Each may leave policies open.
 pub fn check(offered: &QosRequest, requested: &QosRequest) -> Compatibility {
     let policies = |worst: bool| -> Vec<Incompatible> {
-        // The best offer meets the least request, or the least offer the highest request.
+        // The best case is the highest offer and the lowest request; the worst case is the lowest
+        // offer and the highest request.
         let offer = pick(offered, !worst);
         let request = pick(requested, worst);
         incompatibilities(&offer, &request).collect()
@@ -116,7 +119,7 @@ pub fn check(offered: &QosRequest, requested: &QosRequest) -> Compatibility {
     if possible.is_empty() { Compatibility::Compatible } else { Compatibility::Unknown(possible) }
 }
 
-/// The highest or the lowest profile that a request may stand for.
+/// Returns the highest or the lowest profile that a request can resolve to.
 fn pick(request: &QosRequest, highest: bool) -> Qos {
     fn choose<T>(choice: Choice<T>, open: T) -> T {
         if let Choice::Exactly(value) = choice { value } else { open }
@@ -137,7 +140,7 @@ fn pick(request: &QosRequest, highest: bool) -> Qos {
     }
 }
 
-/// Whether the period offered is longer than the one requested; `None` is infinite.
+/// Returns whether the offered period is longer than the requested one; `None` is infinite.
 fn longer(offered: Option<Duration>, requested: Option<Duration>) -> bool {
     requested.is_some_and(|r| offered.is_none_or(|o| o > r))
 }

@@ -11,7 +11,7 @@ use minicbor::{
 };
 use serde::Serializer;
 
-/// The number.
+/// Converts a period to nanoseconds.
 pub fn nanoseconds(period: Duration) -> u64 {
     u64::try_from(period.as_nanos()).unwrap_or(u64::MAX)
 }
@@ -34,7 +34,7 @@ pub(super) fn decode<C>(d: &mut Decoder<'_>, _: &mut C) -> Result<Option<Duratio
     d.u64().map(|period| Some(Duration::from_nanos(period)))
 }
 
-/// An entry that is left out.
+/// The value of an entry that is left out.
 #[expect(clippy::option_option, reason = "what minicbor asks for, of a type that is an option")]
 pub(super) const fn nil() -> Option<Option<Duration>> {
     Some(None)

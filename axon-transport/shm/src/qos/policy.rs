@@ -5,7 +5,7 @@ use std::time::Duration;
 use minicbor::{Decode, Encode};
 use serde::Serialize;
 
-/// Whether every sample must arrive.
+/// The reliability: must every sample arrive?
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode, Serialize)]
 #[cbor(index_only)]
 #[serde(rename_all = "snake_case")]
@@ -18,41 +18,41 @@ pub enum Reliability {
     Reliable,
 }
 
-/// What a subscription that joins late receives.
+/// The samples that a late-joining subscription receives.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode, Serialize)]
 #[cbor(index_only)]
 #[serde(rename_all = "snake_case")]
 pub enum Durability {
-    /// Samples from now on.
+    /// Only samples published from then on.
     #[n(0)]
     Volatile,
-    /// The publisher's history first.
+    /// The publisher's history, then new samples.
     #[n(1)]
     TransientLocal,
 }
 
-/// How many samples are kept.
+/// The number of samples to keep.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode, Serialize)]
 #[cbor(index_only)]
 #[serde(rename_all = "snake_case")]
 pub enum History {
-    /// The newest `depth`.
+    /// The newest `depth` samples.
     #[n(0)]
     KeepLast,
-    /// All, up to the memory budget; then the publisher waits.
+    /// All samples, up to the memory budget; then the publisher waits.
     #[n(1)]
     KeepAll,
 }
 
-/// Who asserts that a publisher is alive.
+/// The party that asserts a publisher's liveliness.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode, Serialize)]
 #[cbor(index_only)]
 #[serde(rename_all = "snake_case")]
 pub enum Liveliness {
-    /// Its session does.
+    /// The publisher's session.
     #[n(0)]
     Automatic,
-    /// The publisher itself, by publishing or asserting.
+    /// The publisher itself, when it publishes or asserts.
     #[n(1)]
     ManualByTopic,
 }
@@ -69,13 +69,13 @@ pub enum Liveliness {
 #[cbor(map)]
 #[non_exhaustive]
 pub struct Qos {
-    /// Whether every sample must arrive.
+    /// The reliability.
     #[n(0)]
     pub reliability: Reliability,
-    /// What late joiners receive.
+    /// The samples that late joiners receive.
     #[n(1)]
     pub durability: Durability,
-    /// How many samples are kept.
+    /// The number of samples to keep.
     #[n(2)]
     pub history: History,
     /// The number of samples kept by [`History::KeepLast`]; at least 1.
@@ -89,7 +89,7 @@ pub struct Qos {
     #[cbor(n(5), with = "super::nanoseconds", has_nil)]
     #[serde(serialize_with = "super::nanoseconds::serialize")]
     pub lifespan: Option<Duration>,
-    /// Who asserts liveliness.
+    /// The party that asserts liveliness.
     #[n(6)]
     pub liveliness: Liveliness,
     /// Time without an assertion after which a publisher counts as not alive.
@@ -99,7 +99,7 @@ pub struct Qos {
 }
 
 impl Default for Qos {
-    /// ROS 2's default profile: RELIABLE, VOLATILE, KEEP_LAST(10).
+    /// Returns ROS 2's default profile: RELIABLE, VOLATILE, KEEP_LAST(10).
     fn default() -> Self {
         Self {
             reliability: Reliability::Reliable,
@@ -115,53 +115,54 @@ impl Default for Qos {
 }
 
 impl Qos {
-    /// RELIABLE and KEEP_ALL: nothing is dropped; a publisher waits for its slowest such reader.
+    /// Returns a RELIABLE, KEEP_ALL profile: no sample is dropped, and a publisher waits for its
+    /// slowest such reader.
     pub fn keep_all() -> Self {
         Self { history: History::KeepAll, ..Self::default() }
     }
 
-    /// ROS 2's sensor data profile: BEST_EFFORT, KEEP_LAST(5).
+    /// Returns ROS 2's sensor data profile: BEST_EFFORT, KEEP_LAST(5).
     pub fn sensor_data() -> Self {
         Self { reliability: Reliability::BestEffort, depth: 5, ..Self::default() }
     }
 
-    /// With this reliability.
+    /// Sets the reliability.
     #[must_use]
     pub fn with_reliability(self, reliability: Reliability) -> Self {
         Self { reliability, ..self }
     }
 
-    /// With this durability.
+    /// Sets the durability.
     #[must_use]
     pub fn with_durability(self, durability: Durability) -> Self {
         Self { durability, ..self }
     }
 
-    /// With this history.
+    /// Sets the history.
     #[must_use]
     pub fn with_history(self, history: History) -> Self {
         Self { history, ..self }
     }
 
-    /// With this depth, for [`History::KeepLast`].
+    /// Sets the depth, for [`History::KeepLast`].
     #[must_use]
     pub fn with_depth(self, depth: u32) -> Self {
         Self { depth, ..self }
     }
 
-    /// With this deadline, or none.
+    /// Sets the deadline; `None` is infinite.
     #[must_use]
     pub fn with_deadline(self, deadline: impl Into<Option<Duration>>) -> Self {
         Self { deadline: deadline.into(), ..self }
     }
 
-    /// With this lifespan, or an infinite one.
+    /// Sets the lifespan; `None` is infinite.
     #[must_use]
     pub fn with_lifespan(self, lifespan: impl Into<Option<Duration>>) -> Self {
         Self { lifespan: lifespan.into(), ..self }
     }
 
-    /// With this liveliness, and this lease, or an infinite one.
+    /// Sets the liveliness and the lease; `None` is an infinite lease.
     #[must_use]
     pub fn with_liveliness(
         self,
@@ -171,7 +172,7 @@ impl Qos {
         Self { liveliness, lease: lease.into(), ..self }
     }
 
-    /// With this lease, or an infinite one.
+    /// Sets the lease; `None` is infinite.
     #[must_use]
     pub fn with_lease(self, lease: impl Into<Option<Duration>>) -> Self {
         Self { lease: lease.into(), ..self }

@@ -8,14 +8,15 @@ use super::{Durability, History, Liveliness, Qos, Reliability};
 /// One policy of a [`QosRequest`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Choice<T> {
-    /// AXON's own default: that of [`Qos::default`].
+    /// The default of AXON: the value in [`Qos::default`].
     #[default]
     SystemDefault,
-    /// A level that matches all endpoints of the other side that the graph holds for the topic when the endpoint is created.
-    /// A subscription gets the highest one that all publishers offer. A publisher offers the highest one, but MANUAL_BY_TOPIC
-    /// only where a subscription requests it. The level is not chosen again later. Clients and servers get the default.
+    /// A level that matches all endpoints of the other side that the graph holds for the topic when the endpoint is
+    /// created. A subscription gets the highest one that all publishers offer. A publisher offers the highest one, but
+    /// MANUAL_BY_TOPIC only if a subscription requests it. The level is not chosen again later. Clients and servers get
+    /// the default.
     BestAvailable,
-    /// This.
+    /// This value.
     Exactly(T),
 }
 
@@ -29,8 +30,9 @@ impl<T> Choice<T> {
     }
 }
 
-/// What a caller asks for. [`for_publisher`](Self::for_publisher) and its siblings make the
-/// [`Qos`] of it that the endpoint has from then on.
+/// The profile that a caller requests. [`for_publisher`](Self::for_publisher),
+/// [`for_subscription`](Self::for_subscription) and [`for_service`](Self::for_service) resolve it to the [`Qos`] of the
+/// endpoint.
 ///
 /// ```
 /// use axon_shm::qos::{Durability, Qos, QosRequest, Reliability};
@@ -46,19 +48,19 @@ impl<T> Choice<T> {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct QosRequest {
-    /// Whether every sample must arrive.
+    /// The reliability.
     pub reliability: Choice<Reliability>,
-    /// What late joiners receive.
+    /// The samples that late joiners receive.
     pub durability: Choice<Durability>,
-    /// How many samples are kept; there is no best one.
+    /// The number of samples to keep; `None` is the default. There is no best choice.
     pub history: Option<History>,
-    /// The number kept by KEEP_LAST; 0 is the default depth.
+    /// The depth for KEEP_LAST; 0 is the default depth.
     pub depth: u32,
     /// Longest time between two samples; `None` is infinite.
     pub deadline: Choice<Option<Duration>>,
     /// Age at which a sample is no longer delivered.
     pub lifespan: Option<Duration>,
-    /// Who asserts liveliness.
+    /// The party that asserts liveliness.
     pub liveliness: Choice<Liveliness>,
     /// Time without an assertion after which a publisher counts as not alive.
     pub lease: Choice<Option<Duration>>,
@@ -80,7 +82,7 @@ impl From<Qos> for QosRequest {
 }
 
 impl QosRequest {
-    /// ROS 2's best-available profile.
+    /// Returns ROS 2's best-available profile.
     pub fn best_available() -> Self {
         Self {
             reliability: Choice::BestAvailable,
@@ -92,9 +94,9 @@ impl QosRequest {
         }
     }
 
-    /// For a publisher, where these subscriptions of its topic are known: RELIABLE and
-    /// TRANSIENT_LOCAL serve every subscription; deadline and lease are the shortest that one of
-    /// them requests, and liveliness is manual when one of them wants it so.
+    /// Resolves the profile for a publisher, whose topic has these subscriptions. The best choices serve every
+    /// subscription: RELIABLE and TRANSIENT_LOCAL, the shortest deadline and the shortest lease that any of them
+    /// requests, and MANUAL_BY_TOPIC if any of them requests it.
     pub fn for_publisher(&self, subscriptions: &[Qos]) -> Qos {
         let shortest = |of: fn(&Qos) -> Option<Duration>| subscriptions.iter().filter_map(of).min();
         let manual = subscriptions.iter().any(|q| q.liveliness == Liveliness::ManualByTopic);
@@ -108,11 +110,10 @@ impl QosRequest {
         })
     }
 
-    /// For a subscription, where these publishers of its topic are known: of each policy the
-    /// highest level that all of them offer. Among no publishers that is the highest there is,
-    /// without deadline or lease.
+    /// Resolves the profile for a subscription, whose topic has these publishers. The best choice of each policy is the
+    /// highest level that all of them offer. Without publishers it is the highest level, but no deadline and no lease.
     pub fn for_subscription(&self, publishers: &[Qos]) -> Qos {
-        // A publisher without a deadline serves no subscription that has one.
+        // A publisher without a deadline does not serve a subscription with one.
         let longest = |of: fn(&Qos) -> Option<Duration>| {
             let all: Option<Vec<Duration>> = publishers.iter().map(of).collect();
             all.and_then(|all| all.into_iter().max())

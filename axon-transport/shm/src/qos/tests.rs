@@ -6,7 +6,7 @@ use proptest::prelude::*;
 
 use super::*;
 
-/// Offered, requested, whether they go together: each kind of policy, every pair.
+/// Offered, requested, and whether they are compatible: every pair of each policy.
 const RELIABILITY: [(Reliability, Reliability, bool); 4] = [
     (Reliability::BestEffort, Reliability::BestEffort, true),
     (Reliability::BestEffort, Reliability::Reliable, false),
@@ -26,7 +26,7 @@ const LIVELINESS: [(Liveliness, Liveliness, bool); 4] = [
     (Liveliness::ManualByTopic, Liveliness::ManualByTopic, true),
 ];
 const SEVEN: Option<Duration> = Some(Duration::from_nanos(7));
-/// Deadline and lease, with x < y.
+/// Values of deadline and lease, with x < y.
 const X: Option<Duration> = Some(Duration::from_nanos(5));
 const Y: Option<Duration> = Some(Duration::from_nanos(6));
 const PERIOD: [(Option<Duration>, Option<Duration>, bool); 9] = [
@@ -117,7 +117,7 @@ fn request() -> impl Strategy<Value = QosRequest> {
     })
 }
 
-/// The endpoints that go together with `mine`.
+/// Returns how many endpoints are compatible.
 fn matched(others: &[Qos], goes: impl Fn(&Qos) -> bool) -> usize {
     others.iter().filter(|q| goes(q)).count()
 }
@@ -132,7 +132,7 @@ proptest! {
         prop_assert_eq!(matched(&others, |q| compatible(&publisher, q).is_ok()), others.len());
     }
 
-    /// Any single policy raised by one level, and somebody is left out.
+    /// If any single policy is raised by one level, at least one endpoint no longer matches.
     #[test]
     fn no_stricter_profile_matches_every_endpoint(others in prop::collection::vec(qos(), 1..6)) {
         let mine = QosRequest::best_available().for_subscription(&others);
@@ -164,7 +164,7 @@ proptest! {
         prop_assert_eq!(request.for_service(), mine);
     }
 
-    /// A verdict on open profiles holds for whatever they become.
+    /// A verdict on open profiles holds for every resolution of them.
     #[test]
     fn a_verdict_holds_for_every_resolution(
         offered in request(),
@@ -187,7 +187,7 @@ proptest! {
         }
     }
 
-    /// Closed profiles leave nothing open.
+    /// Profiles without open policies leave nothing unknown.
     #[test]
     fn closed_profiles_are_judged_as_they_are(offered in qos(), requested in qos()) {
         let found: Vec<_> = incompatibilities(&offered, &requested).collect();

@@ -197,16 +197,15 @@ impl Sample {
     }
 
     /// Returns its bytes in place.
+    /// Returns its bytes in place.
     ///
     /// # Safety
-    /// Where it [is borrowed](Self::is_borrowed), the publisher's process must be trusted not to
-    /// write to a sample that is pinned: what this crate publishes never does. And the slice must
-    /// not be used in a child that was forked while the sample lived.
+    /// If it [is borrowed](Self::is_borrowed), the caller must trust the publisher's process not to write to a pinned
+    /// sample; this crate never does. And the slice must not be used in a child that was forked while the sample lived.
     pub unsafe fn as_slice(&self) -> &[u8] {
-        // SAFETY: `len` bytes from there on are initialized and readable for as long as `self`
-        // lives: those of the vector, or those of the map, which holds as many behind those
-        // that are skipped (`pinned`). That
-        // nobody writes to them meanwhile is the vector's nature, or the caller's promise.
+        // SAFETY: the `len` bytes from there on are initialized and readable as long as `self` lives. They belong to
+        // the vector, or to the map, which holds as many after the skipped bytes (`pinned`). Nobody writes to them
+        // meanwhile: the vector is not shared, and for the map the caller promises it.
         unsafe { slice::from_raw_parts(self.as_ptr(), self.len) }
     }
 }

@@ -24,16 +24,16 @@ impl TrustPublishers {
     /// Trusts the publishers of all samples that are turned into slices by this value or a copy of it.
     ///
     /// # Safety
-    /// As long as such a slice is in use, nobody may write to its bytes. They are in memory that another process
-    /// has mapped for writing, as the bytes of a memory-mapped file are. A reader is told nothing of a write,
-    /// and a write to bytes behind a `&[u8]` is undefined behaviour: what was checked need not be true any more. So
+    /// While such a slice is in use, nobody may write to its bytes. Another process has their memory mapped for
+    /// writing, like the bytes of a memory-mapped file. A reader is not told of a write. A write to bytes behind a
+    /// `&[u8]` is undefined behaviour: properties that were checked may not hold any more. Therefore:
     ///
-    /// - the process of each publisher keeps to the protocol. What this crate publishes does, in whatever
-    ///   version and also where its process is killed: a sample that is pinned is not written to. A process
-    ///   that was taken over, or that overwrites memory by mistake, need not. Where samples come through an AXON
-    ///   daemon, it is one of the publishers.
-    /// - no `&[u8]` that was borrowed from such a slice before a fork is used in the child, where the memory is
-    ///   not mapped. Borrowed there, it is empty.
+    /// - The process of each publisher must keep to the protocol. Any version of this crate does, even if its process
+    ///   is killed: it does not write to a pinned sample. A process that was taken over by an attacker, or that
+    ///   overwrites memory by mistake, may not. If samples come through an AXON daemon, the daemon is one of the
+    ///   publishers.
+    /// - No `&[u8]` that was borrowed from such a slice before a fork may be used in the child, where the memory is not
+    ///   mapped. A slice that is borrowed in the child is empty.
     ///
     /// The memory cannot be truncated, unlike a file's: it is sealed, so that reading it raises no signal.
     #[must_use]
@@ -103,9 +103,9 @@ impl Deref for SampleSlice {
         if self.sample.is_forked() {
             return &[];
         }
-        // SAFETY: a value of this type is made by `into_slice` only, for which a `TrustPublishers` was given:
-        // its maker vouches that nobody writes to the sample, and that what is borrowed here is not used in a
-        // child that is forked later. This process is no such child.
+        // SAFETY: only `into_slice` makes a value of this type, and it takes a `TrustPublishers`. The maker of that
+        // promised that nobody writes to the sample, and that bytes borrowed here are not used in a child that is
+        // forked later. This process is no such child.
         unsafe { self.sample.as_slice() }
     }
 }

@@ -12,29 +12,29 @@ use crate::ring::{
     protocol,
 };
 
-/// A ring's header.
+/// The header of a ring.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct RingCounts {
-    /// Samples published, those that nobody was there to read among them.
+    /// The number of samples published, including those that had no reader.
     pub published: u64,
-    /// The oldest position that stands, and the next one to come.
+    /// The oldest readable position, and the next position to be published.
     pub standing: (u64, u64),
-    /// Samples that are kept at least.
+    /// The number of samples that are kept at least.
     pub window: u64,
-    /// Bytes of its session's memory that the ring takes, beside segments of its publisher's own.
+    /// Bytes of the session's memory that the ring takes, without the publisher's own segments.
     pub bytes: u64,
-    /// Publishes that failed since a KEEP_ALL reader left no room for as long as they could wait.
+    /// Publishes that failed because a KEEP_ALL reader left no room during the whole time that they could wait.
     pub blocked: u64,
-    /// Publishes that failed for want of memory, and samples that went for it though they were to be
+    /// Publishes that failed for lack of memory, and samples that were dropped for lack of it although they had to be
     /// kept: for late joiners, or within the depth of a reader.
     pub no_memory: u64,
-    /// Publishes that failed since readers or loans keep all memory of the publisher's.
+    /// Publishes that failed because readers or loans hold all of the publisher's memory.
     pub pinned: u64,
     array: Option<Array>,
 }
 
 impl RingCounts {
-    /// Reads the header at `at` of the segment behind `memory`; `None` when there is none.
+    /// Reads the header at `at` of the segment behind `memory`; `None` if that fails.
     pub fn read(memory: BorrowedFd<'_>, at: Location) -> Option<Self> {
         let words: [u64; layout::RING as usize / 8] = words(memory, at.offset)?;
         Some(Self {
@@ -49,7 +49,7 @@ impl RingCounts {
         })
     }
 
-    /// Where the descriptor of the sample at `position` is.
+    /// Returns the location of the descriptor of the sample at `position`.
     pub fn descriptor(&self, position: u64) -> Option<Location> {
         let Array { at, descriptors } = self.array?;
         let offset = at.offset.checked_add((position & (descriptors - 1)) * DESCRIPTOR)?;
@@ -57,14 +57,14 @@ impl RingCounts {
     }
 }
 
-/// The source timestamp of the sample at `position`, whose descriptor is at `at` of the segment
-/// behind `memory`. `None` when another sample is there.
+/// Returns the source timestamp of the sample at `position`, whose descriptor is at `at` of the segment behind
+/// `memory`. Returns `None` if the descriptor holds another sample or cannot be read.
 pub fn timestamp(memory: BorrowedFd<'_>, at: Location, position: u64) -> Option<i64> {
     let words: [u64; DESCRIPTOR_WORDS] = words(memory, at.offset)?;
     protocol::timestamp_of(&words, position)
 }
 
-/// A lane.
+/// The counters of a lane.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct LaneCounts {
     /// The next position that the reader takes.
@@ -80,7 +80,7 @@ pub struct LaneCounts {
 }
 
 impl LaneCounts {
-    /// Reads the lane at `at` of the segment behind `memory`; `None` when there is none.
+    /// Reads the lane at `at` of the segment behind `memory`; `None` if that fails.
     pub fn read(memory: BorrowedFd<'_>, at: Location) -> Option<Self> {
         let words: [u64; LANE_WORDS] = words(memory, at.offset)?;
         let received = words[RECEIVED];
@@ -94,7 +94,7 @@ impl LaneCounts {
     }
 }
 
-/// Bytes of memory that are committed to the segment behind `memory`.
+/// Returns the bytes of memory that are committed to the segment behind `memory`.
 pub fn committed(memory: BorrowedFd<'_>) -> u64 {
     let blocks = rustix::fs::fstat(memory).map_or(0, |stat| stat.st_blocks);
     u64::try_from(blocks).unwrap_or(0).saturating_mul(512)

@@ -1,10 +1,10 @@
-//! The journal of a session: which of its rings got samples. A session that reads many rings follows it, and so looks
-//! at the rings that have news and at no others.
+//! The journal of a session: it names the rings that got samples. A session that reads many rings follows it, so that
+//! it looks only at rings with new samples.
 //!
-//! The journal is in the memory of the session that publishes, which alone writes it. An entry names a ring, and says
-//! which entry it is. A follower keeps its place itself. Where it finds another entry than the one that is due, it looks
-//! at all rings of that session: it was overtaken, or the thread that counted the entry has not stored it, or died
-//! before it could, or the session writes what it likes.
+//! The journal is in the memory of the publishing session, which alone writes it. An entry names a ring and carries its
+//! own number. A follower keeps its own position. If it finds another entry than the one that is due, it looks at all
+//! rings of that session. There are four causes: the follower was overtaken; the thread that counted the entry has not
+//! stored it yet; that thread died before it could; or the session breaks the protocol.
 //!
 //! The sample is stored before its entry is counted, so a follower that sees the count finds the sample, whether or not
 //! it sees the entry. The count is stored before the look at the follower's ticket, so no wake-up is lost
@@ -14,9 +14,9 @@ use crate::sync::{Ordering, Site, Word};
 
 /// The words of a session's journal.
 pub(crate) struct Journal<'a, W> {
-    /// How many entries there have been.
+    /// The number of entries so far.
     pub(crate) noted: &'a W,
-    /// The last of them: a power of two, or none.
+    /// The last entries. Their number is a power of two, or zero.
     pub(crate) entries: &'a [W],
 }
 
@@ -28,20 +28,20 @@ impl<W> Clone for Journal<'_, W> {
 
 impl<W> Copy for Journal<'_, W> {}
 
-/// Entry number `place`, from 0: that number's lower 31 bits in the upper half, so that no entry is taken for a later one
-/// in its place, and a bit that tells it from none.
+/// Encodes entry number `place`, counted from 0. The upper half holds the lower 31 bits of the number, so that an entry
+/// is not mistaken for a later one in the same slot, and a bit that marks the slot as used.
 fn entry(place: u64, ring: u32) -> u64 {
     1 << 63 | place << 32 | u64::from(ring)
 }
 
 impl<W: Word> Journal<'_, W> {
-    /// Publisher: a ring has a sample. [`settle`](crate::wake::settle) has to follow.
+    /// Publisher: notes that a ring has a sample. The caller then calls [`settle`](crate::wake::settle).
     #[inline]
     pub(crate) fn note(&self, ring: u32) {
-        // Pairs with the load in `JournalCursor::read`: who sees the count sees the sample.
+        // Pairs with the load in `JournalCursor::read`: a follower that sees the count sees the sample.
         let place = self.noted.fetch_add(1, Site::NotedAdd.order());
         let at = place as usize & (self.entries.len() - 1);
-        // An entry that is seen late is one that is missing.
+        // A follower that sees the count but not yet the entry treats the entry as missing.
         self.entries[at].store(entry(place, ring), Ordering::Relaxed);
     }
 }
@@ -53,14 +53,14 @@ pub(crate) struct JournalCursor(u64);
 /// The rings that a follower has to look at.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum RingsToRead {
-    /// The rings that were named.
+    /// The rings that were named in the call.
     Named,
     /// All rings of the session.
     All,
 }
 
 impl JournalCursor {
-    /// The end of a journal. Look at all rings after it.
+    /// Returns the end of a journal. Look at all rings after this call.
     pub(crate) fn end<W: Word>(journal: Journal<'_, W>) -> Self {
         // Pairs with the count in `note`.
         Self(journal.noted.load(Site::NotedLoad.order()))
@@ -81,7 +81,7 @@ impl JournalCursor {
         }
         for place in (0..count).map(|step| from.wrapping_add(step)) {
             let at = place as usize & (journal.entries.len() - 1);
-            // Relaxed: the count orders the sample, and the entry is one word, which says which one it is.
+            // Relaxed: the count orders the sample. The entry is a single word that carries its own number.
             let found = journal.entries[at].load(Ordering::Relaxed);
             let ring = found as u32;
             if found != entry(place, ring) {
@@ -142,7 +142,7 @@ mod tests {
     fn an_entry_that_is_missing_or_forged_has_all_rings_looked_at() {
         let words = Words::new();
         let mut place = JournalCursor::end(words.journal());
-        // Counted, and not stored: also as the session writes it that counts back or far ahead.
+        // The entry is counted but not stored. Also covers a session that sets the count back or far ahead.
         for noted in [1, 0, u64::MAX, 5] {
             words.0.store(noted, Ordering::Relaxed);
             assert_eq!(words.read(&mut place).0, RingsToRead::All, "{noted}");

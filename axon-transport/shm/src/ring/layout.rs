@@ -9,44 +9,45 @@ use crate::{
     sync::Ordering,
 };
 
-/// Samples of more bytes than this are pinned while they are read, others are copied out: so that
-/// small topics do with the memory that their session has, and each reader of it maps once.
+/// Longest sample in bytes that readers copy out; longer samples are pinned while they are read. So topics with small
+/// samples need only their session's memory, which each reader maps once.
 pub(crate) const COPIED: u64 = 4096;
-/// The same for loans of a publisher that has memory for large samples in any case. It costs about
-/// as much to pin a sample of so many bytes as to copy it.
+/// Like [`COPIED`], for loans of a publisher that has memory for large samples in any case. Pinning a sample of this
+/// length costs about as much as copying it.
 pub(crate) const COPIED_ALWAYS: u64 = 512;
 /// Bytes of a sample that fit in its descriptor.
 pub(crate) const INLINE: usize = 88;
-/// What is lent is aligned to so many bytes, or what is behind its header: as any type of C is at least.
+/// Alignment in bytes of a loan, or of the part behind its header. It is at least that of any C type.
 pub(crate) const ALIGNED: usize = align_of::<u128>();
-/// Lanes of a session: how many rings it can read at a time. A gateway reads the rings of all topics that its peers
-/// subscribe to. Each lane takes memory once it is used.
+/// Lanes of a session: the most rings that it can read at a time. A gateway reads the rings of all topics that its
+/// peers subscribe to. A lane takes memory once it is used.
 pub(crate) const LANES: u32 = 1 << 17;
 
-/// Where the lanes begin in a session's first segment. Above there is nothing else, so that there is room for all of
-/// them whatever else the session has.
+/// Offset of the lanes in a session's first segment. Nothing else is behind them, so there is room for all lanes
+/// whatever else the session allocates.
 pub(crate) const LANES_AT: u64 = 512 << 10;
-/// Bytes of that segment.
+/// Size of a session's first segment in bytes.
 pub(crate) const SESSION_BYTES: u64 = LANES_AT + LANES as u64 * LANE;
-/// Bytes of a further one, which holds no object of more than [`HEAP_BYTES_MAX`] less a header.
+/// Size of a further segment in bytes. A larger object gets a larger segment: up to [`HEAP_BYTES_MAX`], less a header.
 pub(crate) const HEAP_BYTES: u64 = 8 << 20;
 pub(crate) const HEAP_BYTES_MAX: u64 = MAX_DESCRIPTORS * DESCRIPTOR + HEAP_BYTES;
-/// Where the objects of a further segment begin, and where the slots of a publisher's segment do.
+/// Offset of the objects in a further segment; [`SLOTS_AT`] is the offset of the slots in a publisher's segment.
 pub(crate) const HEAP_AT: u64 = 4096;
 pub(crate) const SLOTS_AT: u64 = ALIGN;
 
-/// Entries of a session's journal, which is in its first segment before the objects. As many samples may come between
-/// two looks of a follower before it has to look at all rings: so it looks at few rings for each sample, however many
-/// there are.
+/// Entries of a session's journal, which is in its first segment before the objects. Up to this many samples may come
+/// between two looks of a follower; after more, the follower looks at all rings. So it looks at few rings for each
+/// sample, however many rings there are.
 pub(crate) const JOURNAL: usize = 2048;
-/// Where the objects of a session's first segment begin.
+/// Offset of the objects in a session's first segment.
 pub(crate) const FIRST_AT: u64 = HEAP_AT + JOURNAL as u64 * 8;
 
-/// Numbers of segments have 24 bits.
+/// The largest segment number: 24 bits.
 pub(crate) const MAX_NUMBER: u32 = (1 << 24) - 1;
-/// A ring starts with this many descriptors and doubles.
+/// Descriptors of a new ring. A ring grows by doubling.
 pub(crate) const FIRST_DESCRIPTORS: u64 = 16;
-/// A publish that doubles the array copies what stands: half a GiB is as much as it may take time for.
+/// The most descriptors of a ring. A publish that doubles the array copies all readable descriptors; half a GiB is the
+/// most that it may spend time on.
 pub(crate) const MAX_DESCRIPTORS: u64 = 1 << 22;
 
 pub(crate) const DESCRIPTOR: u64 = 128;
@@ -61,20 +62,20 @@ pub(crate) const RING: u64 = 384;
 pub(crate) const RING_WORDS: usize = RING as usize / 8;
 
 const VERSION: u32 = 4;
-/// Reads otherwise on a machine of another byte order.
+/// Reads as another number on a machine of another byte order.
 const ORDER: u32 = 0x0a0b_0c0d;
 const SEGMENT_MAGIC: u64 = u64::from_ne_bytes(*b"AXONSEG2");
 const RING_MAGIC: u64 = u64::from_ne_bytes(*b"AXONRNG2");
 
 /// Words of a session's first segment.
 pub(crate) mod session {
-    /// Ticket of the wait for samples.
+    /// Ticket of waits for samples.
     pub(crate) const ARMED: usize = 128 / 8;
-    /// Ticket of the wait for room.
+    /// Ticket of waits for room.
     pub(crate) const BLOCKED: usize = 256 / 8;
-    /// How many entries the journal has had.
+    /// The number of entries that the journal has had.
     pub(crate) const NOTED: usize = 384 / 8;
-    /// The entries.
+    /// The entries of the journal.
     pub(crate) const JOURNAL: std::ops::Range<usize> =
         super::HEAP_AT as usize / 8..super::FIRST_AT as usize / 8;
 }
@@ -86,56 +87,57 @@ pub(crate) mod lane {
     pub(crate) const RECEIVED: usize = 2;
     pub(crate) const LOST: usize = 3;
     pub(crate) const SKIPPED: usize = 4;
-    /// The highest number of the publisher's segments that came to the reader. Lower ones may not
-    /// have: those of other publishers do not, and one that was short of something comes later.
+    /// The highest number of the publisher's segments that the reader has received. Lower numbers may be missing: the
+    /// segments of other publishers are, and a segment for which the reader was short of something comes later.
     pub(crate) const MAPPED: usize = 5;
     /// The first of the pin records.
     pub(crate) const PINS: usize = 6;
     pub(crate) const READER: usize = 12;
     /// The source timestamp of the sample that was taken last.
     pub(crate) const TAKEN: usize = 14;
-    /// Of the samples below the cursor, how many the reader gave up; whose they are in its upper bits.
+    /// The number of samples below the cursor that the reader gave up. The upper bits identify the attachment.
     pub(crate) const GIVEN_UP: usize = 15;
 }
 
 /// Words of a ring's header.
 pub(crate) mod ring {
     pub(crate) const WRITER: usize = 2;
-    /// Samples that are kept at least.
+    /// The number of samples that are kept at least.
     pub(crate) const WINDOW: usize = 4;
     /// Bytes of the session's memory that the ring, its descriptors and its blocks take.
     pub(crate) const BYTES: usize = 5;
-    /// Publishes that failed, by why.
+    /// Publishes that failed, by cause.
     pub(crate) const BLOCKED: usize = 6;
     pub(crate) const NO_MEMORY: usize = 7;
     pub(crate) const PINNED: usize = 8;
-    /// The ring's number in its session, by which the journal names it.
+    /// The ring's number in its session. The journal names the ring by it.
     pub(crate) const NUMBER: usize = 9;
-    /// Publishes that found no room since KEEP_ALL readers had not taken the oldest sample, if they waited or not.
+    /// Publishes that found no room because a KEEP_ALL reader had not taken the oldest sample, whether they waited or
+    /// not.
     pub(crate) const REFUSED: usize = 10;
     pub(crate) const HEAD: usize = 128 / 8;
-    /// Samples published, those that nobody was there to read among them.
+    /// The number of samples published, including those that had no reader.
     pub(crate) const PUBLISHED: usize = 136 / 8;
-    /// When the publisher said last that it is alive, where its lease is finite.
+    /// When the publisher last asserted its liveliness, if its lease is finite.
     pub(crate) const ASSERTED: usize = 144 / 8;
-    /// When it published last, where its deadline is finite.
+    /// When the publisher last published, if its deadline is finite.
     pub(crate) const SAMPLED: usize = 152 / 8;
     pub(crate) const TAIL: usize = 256 / 8;
-    /// Where the descriptors are, and how many.
+    /// The location and number of the descriptors.
     pub(crate) const ARRAY: usize = 264 / 8;
-    /// The lease and the lifespan that it offers, in nanoseconds; 0 where they never end.
+    /// The offered lease and lifespan in nanoseconds; 0 if infinite.
     pub(crate) const LEASE: usize = 272 / 8;
     pub(crate) const LIFESPAN: usize = 280 / 8;
 }
 
-/// What a segment is for.
+/// The purpose of a segment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SegmentKind {
-    /// A session's first: the words by which it is woken, and objects.
+    /// A session's first segment: the words for its wake-ups, and objects.
     Session,
-    /// More room for objects.
+    /// A further segment for objects.
     Heap,
-    /// Large samples of this publisher.
+    /// A segment for large samples of this publisher.
     Samples(Gid),
 }
 
@@ -156,7 +158,7 @@ impl SegmentKind {
     }
 }
 
-/// Where an object of a session is.
+/// The location of an object of a session.
 #[derive(
     Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, minicbor::Encode, minicbor::Decode,
 )]
@@ -164,19 +166,19 @@ pub struct Location {
     /// The number of the session's segment.
     #[n(0)]
     pub segment: u32,
-    /// The offset in it, in bytes: a multiple of 128, but for a sample that was lent behind a header.
+    /// The offset in the segment in bytes: a multiple of 128, except for a sample that was lent behind a header.
     #[n(1)]
     pub offset: u64,
 }
 
 impl Location {
-    /// The first word and the one after the last of `bytes` bytes there, if a segment of `limit`
-    /// words has them.
+    /// Returns the range of words of the `bytes` bytes at this location. Returns `None` if a segment of `limit` words
+    /// does not contain them.
     pub(crate) fn words(&self, bytes: u64, limit: usize) -> Option<std::ops::Range<usize>> {
         if !self.offset.is_multiple_of(LINE) { None } else { self.words_of(bytes, limit) }
     }
 
-    /// As [`words`](Self::words), of bytes that begin anywhere, also within the first word.
+    /// Like [`words`](Self::words), for bytes that may begin anywhere, also within a word.
     pub(crate) fn words_of(&self, bytes: u64, limit: usize) -> Option<std::ops::Range<usize>> {
         if self.offset < HEAP_AT {
             return None;
@@ -188,7 +190,7 @@ impl Location {
     }
 }
 
-/// Where a ring's descriptors are. One word, so that growing is one store.
+/// The location of a ring's descriptors. It is encoded in one word, so that growing the array takes one store.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Array {
     pub(crate) at: Location,
@@ -202,7 +204,7 @@ impl Array {
         u64::from(self.at.segment) << 40 | (self.at.offset / LINE) << 6 | log2
     }
 
-    /// `None` when the word makes no sense.
+    /// Decodes a word; `None` if it is invalid.
     pub(crate) fn from_word(word: u64) -> Option<Self> {
         let offset = (word >> 6 & ((1 << 34) - 1)) * LINE;
         let descriptors = 1u64.checked_shl((word & 63) as u32)?;
@@ -225,7 +227,7 @@ fn read_id(words: &[AtomicU64], at: usize) -> [u8; 16] {
     id
 }
 
-/// Says what a new segment is, before any other process has its descriptor.
+/// Writes the header of a new segment, before any other process has its descriptor.
 pub(crate) fn write_segment(
     words: &[AtomicU64],
     session: SessionId,
@@ -241,7 +243,7 @@ pub(crate) fn write_segment(
     write_id(words, 6, kind.publisher().0);
 }
 
-/// Checks that another session's segment is the one that it was announced as.
+/// Checks that another session's segment has the properties that were announced.
 pub(crate) fn check_segment(
     words: &[AtomicU64],
     session: SessionId,
@@ -274,7 +276,7 @@ pub(crate) fn check_segment(
     Ok(())
 }
 
-/// Writes the header of an empty ring, which nobody knows of yet.
+/// Writes the header of an empty ring that no reader knows yet.
 pub(crate) fn write_ring(words: &[AtomicU64], writer: Gid, number: u32, array: &Array) {
     words.iter().for_each(|word| word.store(0, Ordering::Relaxed));
     write_id(words, ring::WRITER, writer.0);
@@ -295,7 +297,7 @@ pub(crate) fn check_ring(words: &[AtomicU64], writer: Gid) -> Result<(), ShmErro
     Ok(())
 }
 
-/// Two 32-bit fields that share a word.
+/// Splits a word into two 32-bit fields, the lower one first.
 pub(crate) fn halves(word: u64) -> (u32, u32) {
     (word as u32, (word >> 32) as u32)
 }

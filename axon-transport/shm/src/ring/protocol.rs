@@ -24,24 +24,24 @@ use crate::{
 const STAMP: usize = 0;
 const SEQUENCE: usize = 1;
 const TIMESTAMP: usize = 2;
-/// Length in bytes, and in what kind of place of which segment.
+/// The sample's length in bytes, the kind of its location, and the number of its segment.
 const PLACE: usize = 3;
 const DATA: usize = 4;
-/// When the sample was published, on the monotonic clock, where the lifespan is finite.
+/// The time of publication on the monotonic clock, if the lifespan is finite.
 const PUBLISHED: usize = DESCRIPTOR_WORDS - 1;
 const INLINE_WORDS: usize = PUBLISHED - DATA;
 
-/// No ring gets this far; a head beyond it was corrupted.
+/// The largest head. No ring gets this far; a larger head is corrupt.
 pub(crate) const MAX_POSITION: u64 = 1 << 62;
 
-/// Where a sample's bytes are.
+/// The location of a sample's bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum PayloadLocation {
     /// In the descriptor.
     Inline,
-    /// In memory that is written over as soon as the sample is given up.
+    /// In memory that is overwritten as soon as the sample is given up.
     Block(Location),
-    /// In memory that stays as it is while it is pinned.
+    /// In memory that does not change while the sample is pinned.
     Slot(Location),
 }
 
@@ -55,12 +55,12 @@ impl PayloadLocation {
     }
 }
 
-/// What a descriptor says of its sample.
+/// The fields of a descriptor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Record {
     pub(crate) sequence: u64,
     pub(crate) timestamp: i64,
-    /// 0 where the ring's lifespan is infinite.
+    /// 0 if the ring's lifespan is infinite.
     pub(crate) published: u64,
     pub(crate) len: u32,
     pub(crate) place: PayloadLocation,
@@ -70,37 +70,36 @@ fn descriptor<W>(array: &[W], position: u64) -> &[W] {
     &array[words_of(array.len(), position)]
 }
 
-/// The words of a position's descriptor in an array of `len` words.
+/// Returns the range of words of a position's descriptor, in an array of `len` words.
 fn words_of(len: usize, position: u64) -> Range<usize> {
     let mask = (len / DESCRIPTOR_WORDS) as u64 - 1;
     let start = (position & mask) as usize * DESCRIPTOR_WORDS;
     start..start + DESCRIPTOR_WORDS
 }
 
-/// The source timestamp in a descriptor's words, as they were read at some time, if it was
-/// `position`'s.
+/// Returns the source timestamp from a copy of a descriptor's words, if the descriptor held `position` at that time.
 pub(crate) fn timestamp_of(words: &[u64; DESCRIPTOR_WORDS], position: u64) -> Option<i64> {
     let stamp = position.checked_mul(2)?.checked_add(2)?;
     (words[STAMP] == stamp).then_some(words[TIMESTAMP].cast_signed())
 }
 
-/// Publisher: positions below `tail` are about to be reused.
+/// Publisher: raises the tail, before positions below `tail` are reused.
 pub(crate) fn retire<W: Word>(ring: &[W], tail: u64) {
     // Pairs with `bounds`: a reader that sees this tail sees a head at least as high.
     ring[TAIL].store(tail, Site::TailStore.order());
 }
 
-/// Publisher: stores to descriptors, blocks or whatever else the heap gave out follow on this
-/// thread. A reader that sees one of them sees the tail that was retired, and the array that was
-/// replaced before, by this thread or one that this thread synchronized with.
+/// Publisher: fences before this thread stores to descriptors, blocks or other memory of the heap. A reader that sees
+/// one of those stores also sees the tail that was raised, and the array that was replaced, before this call by this
+/// thread or by one that this thread synchronized with.
 #[inline]
 pub(crate) fn about_to_write<W: Word>() {
     // Pairs with the acquire fence of `stands`.
     fence_at::<W>(Site::ReuseFence);
 }
 
-/// Publisher: makes `position` visible, after [`about_to_write`]. A sample outside the descriptor
-/// has been copied in already.
+/// Publisher: makes `position` visible, after [`about_to_write`]. If the sample is not in the descriptor, it has been
+/// copied already.
 pub(crate) fn publish<W: Word>(
     ring: &[W],
     array: &[W],
@@ -128,18 +127,18 @@ pub(crate) fn publish<W: Word>(
     ring[HEAD].store(position + 1, Site::HeadStore.order());
 }
 
-/// Publisher: the number of the sample at a position that stands.
+/// Publisher: returns the sequence number of the sample at a readable position.
 pub(crate) fn number<W: Word>(array: &[W], position: u64) -> u64 {
-    // Relaxed: nobody else stores to it.
+    // Relaxed: no other process or thread stores to it.
     descriptor(array, position)[SEQUENCE].load(Ordering::Relaxed)
 }
 
-/// Publisher: fills a new array with what stands, from `tail` up to `head`, in the old one. After
+/// Publisher: fills a new array with the descriptors from `tail` up to `head` of the old one. Call it after
 /// [`about_to_write`]; [`replace`] follows.
 pub(crate) fn copy_descriptors<W: Word>(old: &[W], new: &[W], tail: u64, head: u64) {
     let descriptors = (new.len() / DESCRIPTOR_WORDS) as u64;
-    // As if each had been used last time round: a reader that asks for a position that was given
-    // up must find that it is late, and one that asks for the next must wait.
+    // Stamps each descriptor as if it had been used in the round before. A reader that asks for a position that was
+    // given up must find that it is late, and a reader that asks for the next position must wait.
     for next in head..head + descriptors {
         let stamp = next.checked_sub(descriptors).map_or(0, |last| 2 * last + 2);
         descriptor(new, next)[STAMP].store(stamp, Ordering::Relaxed);
@@ -151,23 +150,23 @@ pub(crate) fn copy_descriptors<W: Word>(old: &[W], new: &[W], tail: u64, head: u
     }
 }
 
-/// Publisher: from now on the descriptors are in another array. The old one may be used for
-/// something else, after [`about_to_write`].
+/// Publisher: replaces the array of descriptors. The old array may be used for something else, after
+/// [`about_to_write`].
 pub(crate) fn replace<W: Word>(ring: &[W], array: u64) {
-    // Pairs with `array`: a reader that sees it sees the descriptors there.
+    // Pairs with `array`: a reader that sees the new word sees the descriptors there.
     ring[ARRAY].store(array, Site::ArrayStore.order());
 }
 
-/// Reader: the word that says where the descriptors are.
+/// Reader: returns the word with the location of the descriptors.
 #[inline]
 pub(crate) fn array<W: Word>(ring: &[W]) -> u64 {
     // Pairs with `replace`.
     ring[ARRAY].load(Site::ArrayLoad.order())
 }
 
-/// Reader: the oldest position that stands and the next position to come.
+/// Reader: returns the oldest readable position and the next position to be published.
 pub(crate) fn bounds<W: Word>(ring: &[W]) -> Result<(u64, u64), &'static str> {
-    // In this order: a tail is never above the head that a later load sees.
+    // In this order: a head that is loaded after a tail is never below that tail.
     let tail = ring[TAIL].load(Site::TailLoad.order());
     let head = ring[HEAD].load(Site::HeadLoad.order());
     if tail > head || head > MAX_POSITION {
@@ -176,31 +175,31 @@ pub(crate) fn bounds<W: Word>(ring: &[W]) -> Result<(u64, u64), &'static str> {
     Ok((tail, head))
 }
 
-/// Reader: how a position's descriptor looks.
+/// Reader: the state of a position's descriptor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum PositionState {
     /// The position is not published yet.
     Ahead,
-    /// It stands, or has just been given up.
+    /// The position is readable, or has just been given up.
     Here,
-    /// A later one has its place.
+    /// The descriptor holds a later position.
     Gone,
 }
 
-/// Reader: what a look at a published position gave.
+/// Reader: the result of reading a published descriptor.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum RecordRead {
     Sample(Record),
-    /// The publisher has reused the descriptor: look at the tail again.
+    /// The publisher has reused the descriptor. The reader has to load the tail again.
     Lapped,
     Corrupt(&'static str),
 }
 
-/// A ring as a reader sees it.
+/// A reader's view of a ring.
 pub(crate) struct View<'a, W> {
-    /// Its header.
+    /// The ring's header.
     pub(crate) ring: &'a [W],
-    /// What [`array`] said, and the descriptors there.
+    /// The word from [`array`], and the descriptors at its location.
     pub(crate) word: u64,
     pub(crate) array: &'a [W],
 }
@@ -217,15 +216,15 @@ impl<'a, W: Word> View<'a, W> {
         }
     }
 
-    /// The record at `position`, whose descriptor is [here](PositionState::Here). Where its bytes are has
-    /// not been checked.
+    /// Reads the record at `position`, whose descriptor is [here](PositionState::Here). The location of the sample is
+    /// not checked.
     pub(crate) fn look(&self, position: u64) -> RecordRead {
         let slot = descriptor(self.array, position);
         let sequence = slot[SEQUENCE].load(Ordering::Relaxed);
         let timestamp = slot[TIMESTAMP].load(Ordering::Relaxed).cast_signed();
         let (len, place) = halves(slot[PLACE].load(Ordering::Relaxed));
         let offset = slot[DATA].load(Ordering::Relaxed);
-        // Of a short sample the word is in a cache line that need not come otherwise.
+        // For a short sample, the word with the time is in a cache line that otherwise is not needed.
         let finite = self.ring[LIFESPAN].load(Ordering::Relaxed) != 0;
         let published = if finite { slot[PUBLISHED].load(Ordering::Relaxed) } else { 0 };
         if !self.stands(position) {
@@ -244,29 +243,30 @@ impl<'a, W: Word> View<'a, W> {
         RecordRead::Sample(Record { sequence, timestamp, published, len, place })
     }
 
-    /// Has the rest of a descriptor that is [here](PositionState::Here) on its way from the publisher's core
-    /// while the caller gets ready to take it: what locks in between would have it wait.
+    /// Prefetches the rest of a descriptor that is [here](PositionState::Here) from the publisher's core, while the
+    /// caller prepares to take the sample. Otherwise the atomic operations of the locks in between would delay the
+    /// fetch.
     #[inline]
     pub(crate) fn expect(&self, position: u64) {
         prefetch(&descriptor(self.array, position)[DESCRIPTOR_WORDS / 2]);
     }
 
-    /// The words of a sample that is in its descriptor.
+    /// Returns the words of a sample that is in its descriptor.
     pub(crate) fn inline(&self, position: u64) -> &'a [W] {
         &descriptor(self.array, position)[DATA..PUBLISHED]
     }
 
-    /// Whether all that was loaded of `position` so far is what was published.
+    /// Returns whether everything that was loaded of `position` so far is what was published.
     pub(crate) fn stands(&self, position: u64) -> bool {
-        // Pairs with the release fence of `about_to_write`: had one of the loads before seen a
-        // reuse, the loads after see the tail and the array that were stored ahead of it.
+        // Pairs with the release fence of `about_to_write`. If one of the earlier loads saw a reuse, the following
+        // loads see the tail and the array that were stored before it.
         fence_at::<W>(Site::StandsFence);
         self.ring[TAIL].load(Ordering::Relaxed) <= position
             && self.ring[ARRAY].load(Ordering::Relaxed) == self.word
     }
 }
 
-/// Copies `bytes` into words; the last is filled up with zeros.
+/// Copies `bytes` into words and pads the last word with zeros.
 pub(crate) fn copy_in<W: Word>(words: &[W], bytes: &[u8]) {
     let (whole, rest) = bytes.as_chunks::<8>();
     for (word, chunk) in words.iter().zip(whole) {

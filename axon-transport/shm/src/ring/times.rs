@@ -9,28 +9,28 @@ use crate::{
     sync::{Ordering, Word},
 };
 
-/// What a reader sees of its publisher's times.
+/// The times of a publisher as its readers see them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Times {
-    /// The lease that it offers; `None` never ends.
+    /// The offered lease; `None` if it is infinite.
     pub lease: Option<u64>,
-    /// The age at which its samples are not delivered any more.
+    /// The age at which samples are no longer delivered; `None` if it is infinite.
     pub lifespan: Option<u64>,
-    /// When it last said that it is alive, if it ever did.
+    /// When the publisher last asserted its liveliness; `None` if it never did.
     pub asserted: Option<u64>,
-    /// When it last published, if its deadline is finite and it ever did.
+    /// When the publisher last published; `None` if its deadline is infinite or it never published.
     pub sampled: Option<u64>,
 }
 
-/// Writes what is offered into the header of a new ring.
+/// Writes the offered lease and lifespan into the header of a new ring.
 pub(crate) fn offer(words: &[impl Word], qos: &Qos) {
-    // 0 is not a time, but the shortest that there is comes to the same.
+    // 0 means infinite. A period of 0 becomes 1 ns, which has the same effect.
     let period = |period: Option<Duration>| period.map_or(0, |period| nanoseconds(period).max(1));
     words[ring::LEASE].store(period(qos.lease), Ordering::Relaxed);
     words[ring::LIFESPAN].store(period(qos.lifespan), Ordering::Relaxed);
 }
 
-/// The words stand for nothing but themselves, so that nothing need be ordered with them.
+/// Reads the times. Each word is independent of other memory, so relaxed loads suffice.
 pub(crate) fn read(words: &[impl Word]) -> Times {
     let time = |word: usize| Some(words[word].load(Ordering::Relaxed)).filter(|time| *time != 0);
     Times {

@@ -8,33 +8,32 @@ use crate::{
     qos::Qos,
 };
 
-/// What a ring is made for.
+/// The options of a ring.
 #[derive(Clone, Copy, Debug)]
 pub struct RingOptions {
-    /// The publisher.
+    /// The publisher's GID.
     pub gid: Gid,
-    /// What it offers.
+    /// The offered QoS.
     pub qos: Qos,
-    /// Bytes of samples to keep before the oldest go; one sample is always kept.
+    /// Bytes of samples to keep before the oldest are dropped. One sample is always kept.
     pub budget: u64,
     /// The largest sample in bytes.
     pub max_message: u64,
-    /// The length in bytes that is expected of samples. Where it is more than 512, readers have
-    /// memory of the publisher's own before the first of them comes, in which there are all
-    /// samples of more than 4 KiB, and loans of more than 512 bytes.
+    /// The expected length of samples in bytes. If it is more than 512, readers get the publisher's own memory before
+    /// the first sample. All samples of more than 4 KiB, and loans of more than 512 bytes, are there.
     pub expected: u64,
 }
 
-/// What a reader is given when it attaches.
+/// The terms of a reader's attachment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Grant {
-    /// Names this attachment; never 0.
+    /// The number of this attachment; never 0.
     pub generation: u64,
     /// The first position that the reader takes.
     pub first: u64,
 }
 
-/// What goes with a sample.
+/// The metadata of a sample.
 ///
 /// ```
 /// use std::time::SystemTime;
@@ -66,20 +65,20 @@ impl Meta {
         Self::at_nanos(sequence, unix_nanos(source_time))
     }
 
-    /// As [`new`](Self::new), with the source time in nanoseconds since the Unix epoch. For this project's crates.
+    /// Like [`new`](Self::new), with the source time in nanoseconds since the Unix epoch. For this project's crates.
     #[doc(hidden)]
     pub fn at_nanos(sequence: u64, source_nanos: i64) -> Self {
         Self { sequence, source_nanos, published_nanos: 0 }
     }
 
-    /// Sets the time of publication, by this host's CLOCK_MONOTONIC, to another one than the time of the call. The
-    /// publisher's lifespan counts from then.
+    /// Sets the time of publication, by this host's CLOCK_MONOTONIC; the default is the time of the call that
+    /// publishes. The publisher's lifespan counts from there.
     #[must_use]
     pub fn with_published(self, published: Duration) -> Self {
         self.with_published_nanos(u64::try_from(published.as_nanos()).unwrap_or(u64::MAX))
     }
 
-    /// As [`with_published`](Self::with_published), in nanoseconds. For this project's crates.
+    /// Like [`with_published`](Self::with_published), in nanoseconds. For this project's crates.
     #[doc(hidden)]
     #[must_use]
     pub fn with_published_nanos(self, published_nanos: u64) -> Self {
@@ -91,8 +90,8 @@ impl Meta {
         from_unix_nanos(self.source_nanos)
     }
 
-    /// Returns the time of publication by this host's CLOCK_MONOTONIC: of a sample from another host its arrival less
-    /// its age. `None` in a sample that was taken, where the publisher's lifespan is infinite.
+    /// Returns the time of publication by this host's CLOCK_MONOTONIC. For a sample from another host it is the arrival
+    /// less the sample's age. Returns `None` for a taken sample if the publisher's lifespan is infinite.
     pub fn published(&self) -> Option<Duration> {
         (self.published_nanos > 0).then(|| Duration::from_nanos(self.published_nanos))
     }
@@ -114,16 +113,16 @@ impl Meta {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Published {
-    /// Its position in the ring, counted from 0 without gaps. None where nobody reads: then only
-    /// its number is used up.
+    /// The sample's position in the ring, counted from 0 without gaps. `None` if nobody reads: then the publish only
+    /// uses up its number.
     pub position: Option<u64>,
 }
 
 /// A sample that was taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Taken {
-    /// What goes with it.
+    /// The sample's metadata.
     pub meta: Meta,
-    /// Its position in the publisher's ring.
+    /// The sample's position in the publisher's ring.
     pub position: u64,
 }

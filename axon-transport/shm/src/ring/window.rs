@@ -2,10 +2,10 @@
 
 use crate::qos::{Durability, History, Qos, Reliability};
 
-/// The history that is kept at least, for readers that are late by a burst.
+/// The smallest window in samples. It allows for readers that lag by a burst.
 pub(crate) const BURST: u64 = 16;
 
-/// How many samples are kept for a profile at least.
+/// Returns how many samples a ring keeps at least for a profile.
 #[inline]
 pub(crate) fn wanted(qos: &Qos) -> u64 {
     match qos.history {
@@ -14,7 +14,7 @@ pub(crate) fn wanted(qos: &Qos) -> u64 {
     }
 }
 
-/// How many samples a profile keeps.
+/// Returns the history depth of a profile in samples.
 #[inline]
 pub(crate) fn depth(qos: &Qos) -> u64 {
     match qos.history {
@@ -23,13 +23,13 @@ pub(crate) fn depth(qos: &Qos) -> u64 {
     }
 }
 
-/// Whether a publisher keeps all that its memory holds for readers that come later.
+/// Returns whether a publisher keeps for late joiners everything that fits in its memory.
 #[inline]
 pub(crate) fn keeps_all(qos: &Qos) -> bool {
     qos.history == History::KeepAll && qos.durability == Durability::TransientLocal
 }
 
-/// Whether a profile loses nothing rather than go on.
+/// Returns whether a profile waits rather than lose a sample (RELIABLE and KEEP_ALL).
 #[inline]
 pub fn holds(qos: &Qos) -> bool {
     qos.reliability == Reliability::Reliable && qos.history == History::KeepAll

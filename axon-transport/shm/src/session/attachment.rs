@@ -88,7 +88,7 @@ impl Drop for Unpin<'_> {
     }
 }
 
-/// A sample that stays where it is.
+/// A pinned sample. Dropping this value unpins it.
 pub(crate) struct Pin {
     attachment: Arc<Attachment>,
     record: usize,

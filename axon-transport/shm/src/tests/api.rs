@@ -134,7 +134,7 @@ fn misbehaving_peers_are_refused_at_connect() {
     let publisher = publisher(&context, Qos::default());
     let options = SubscriberOptions::new(Qos::default());
     let soon = Some(Duration::from_millis(5));
-    // Silence, and nobody there.
+    // A silent peer, and a closed socket.
     let (ours, theirs) = pair();
     assert!(matches!(publisher.serve(&ours, soon), Err(ConnectError::Timeout)));
     let silent = Subscriber::connect(&context, &theirs, options, soon);
@@ -144,7 +144,7 @@ fn misbehaving_peers_are_refused_at_connect() {
     assert!(matches!(publisher.serve(&ours, soon), Err(ConnectError::Closed)));
     let closed = Subscriber::connect(&context, &ours, options, soon);
     assert!(matches!(closed, Err(ConnectError::Closed)));
-    // Noise: packets, and a stream.
+    // Invalid data: as packets, and as a stream.
     for noise in [&b""[..], b"x", &[0x82, 3, 0], &[0x82, 2, 0x82, 7, 0x80], &[0xff; 2000]] {
         let (ours, theirs) = UnixDatagram::pair().unwrap();
         theirs.send(noise).unwrap();
@@ -157,7 +157,7 @@ fn misbehaving_peers_are_refused_at_connect() {
     let (ours, mut theirs) = UnixStream::pair().unwrap();
     std::io::Write::write_all(&mut theirs, &[0xff; 100]).unwrap();
     assert!(matches!(publisher.serve(&ours, soon), Err(ConnectError::Protocol(_))));
-    // A question without its descriptors, and one that names another's GID.
+    // A request with the descriptors of another session, and one with a GID of another session.
     let (ours, theirs) = UnixDatagram::pair().unwrap();
     let (a, b) = (SessionId::random(), SessionId::random());
     for reader in [Gid::new(a, 1), Gid::new(b, 1)] {
@@ -167,7 +167,7 @@ fn misbehaving_peers_are_refused_at_connect() {
         let (_, line) = connect::line().unwrap();
         channel.ask(&asked, &context.session().descriptors().unwrap(), line).unwrap();
         assert!(publisher.serve(&ours, soon).is_err());
-        // It is told.
+        // The subscriber is told.
         assert!(channel.await_granted(reader).is_err());
     }
     assert!(publisher.subscribers().is_empty());
@@ -188,7 +188,7 @@ fn an_answer_that_comes_too_late_is_not_taken_for_the_next() {
         let mut subscriber = Subscriber::connect(&there, &theirs, options, SOON).unwrap();
         publisher.publish(b"x").unwrap();
         assert_eq!(subscriber.recv(SOON).unwrap().unwrap().len(), 1);
-        // The other one never was.
+        // The subscriber of the late answer was never connected.
         assert_eq!(publisher.reap().len(), 1);
         assert_eq!(publisher.subscribers(), [subscriber.gid()]);
     });

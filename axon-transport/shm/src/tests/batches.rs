@@ -25,7 +25,7 @@ fn samples_that_are_taken_together_stand_one_behind_the_other() {
     let (a, b) = (session(), session());
     let writer = writer(&a, keep_last(100), 1 << 20);
     let mut reader = attach(&writer, &a, &b, keep_last(100));
-    // In the descriptor, in a block, and in a place of its own.
+    // Inline samples, samples in blocks, and samples in slots.
     let lengths = [10, 80, 0, 2000, 300, 9000, 20, 5000];
     for (sequence, len) in lengths.into_iter().enumerate() {
         writer.publish(meta(sequence as u64), &pattern(sequence as u64, len)).unwrap();

@@ -3,7 +3,7 @@
 use super::*;
 use crate::{memory::segment::OwnMapping, session::pin_lanes::OF_PROCESS};
 
-/// A segment as a session would announce it: of address space, and of next to no memory.
+/// A segment as a session would announce it, with much address space and almost no memory.
 fn sparse(of: &SessionSegment, number: u32, bytes: u64) -> OwnMapping {
     let segment = OwnMapping::create("test", bytes).unwrap();
     layout::write_segment(segment.words(), of.id(), number, SegmentKind::Heap);
@@ -18,18 +18,18 @@ fn a_session_fills_no_address_space_but_its_share() {
         let info = SegmentInfo { number, kind: SegmentKind::Heap };
         peer.add_segment(info, sparse(&a, number, crate::limits::MAX_SEGMENT).fd())
     };
-    // Four tebibytes of it, less what the first segment takes.
+    // They take four tebibytes of address space together, less the first segment.
     (1..64).for_each(|number| add(number).unwrap());
     let error = add(64).expect_err("one too many");
     assert!(matches!(error, ShmError::AddressSpace { .. }), "{error}");
     assert!(!peer.has_segment(64), "it is missing, and not refused");
-    // Nor more maps than there may be, small as they are.
+    // The limit on the number of maps also holds, however small the maps are.
     let many = (65..2000).find(|&number| {
         let info = SegmentInfo { number, kind: SegmentKind::Heap };
         peer.add_segment(info, sparse(&a, number, layout::ALIGN).fd()).is_err()
     });
     assert_eq!(many, Some(64 + 1024 - 63), "with the first");
-    // What is given up makes room.
+    // A segment that was removed makes room.
     peer.remove_segment(1);
     add(64).unwrap();
 }
@@ -63,7 +63,7 @@ fn a_process_gets_no_more_lanes_of_a_ring_than_it_may() {
     let (a, sessions) = (session(), [session(), session()]);
     let writer = writer(&a, keep_last(1), 0);
     let from = sessions.each_ref().map(|session| peer(&a, session));
-    // One subscription that asks with lane after lane, and opens each.
+    // One subscription asks with one lane after another, and opens each.
     let ask = |lane: &Lane, which: usize| {
         writer.attach(ReaderInfo {
             gid: Gid::new(sessions[which].id(), 7),
@@ -91,10 +91,10 @@ fn a_process_gets_no_more_lanes_of_a_ring_than_it_may() {
     let mut both = sessions.each_ref().map(|session| Gid::new(session.id(), 7));
     both.sort();
     assert_eq!(gids, both, "those that it had it has");
-    // Its own process may do to itself what it likes.
+    // Readers in the publisher's own session have no limit.
     let own: Vec<_> = (0..OF_PROCESS + 1).map(|_| attach(&writer, &a, &a, keep_last(1))).collect();
     drop(own);
-    // Those that leave make room.
+    // A reader that leaves makes room.
     drop(lanes.pop());
     let lane = sessions[0].allocate_lane().unwrap();
     assert!(ask(&lane, 0).is_ok());

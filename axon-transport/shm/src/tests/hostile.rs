@@ -20,16 +20,16 @@ const RING: u64 = layout::HEAP_AT;
 const ARRAY: u64 = RING + 512;
 const SLOTS: u64 = 16;
 const BLOCK: u64 = 32 << 10;
-/// Of a generation: samples of any length may be pinned.
+/// The bits of a generation that permit pins of any length.
 const ALL: u64 = 63 << 24;
 
-/// A session whose every word a test may corrupt, with a ring in it.
+/// A session with a ring, of which a test may corrupt every word.
 struct HostileSession {
     segment: OwnMapping,
     id: SessionId,
     gid: Gid,
     reader: Arc<SessionSegment>,
-    /// What it grants.
+    /// The generation that it grants.
     generation: u64,
 }
 
@@ -94,7 +94,7 @@ impl HostileSession {
         Reader::map(options)
     }
 
-    /// A descriptor as a publisher leaves it, but for what the test changes.
+    /// Writes a descriptor as a publisher does, except for the given fields.
     fn descriptor(&self, position: u64, len: u32, place: u32, data: u64) {
         let start = ARRAY as usize / 8 + (position % SLOTS) as usize * layout::DESCRIPTOR_WORDS;
         let stamp = position.wrapping_mul(2).wrapping_add(2);
@@ -145,7 +145,7 @@ fn a_segment_must_be_a_sealed_memfd_of_a_sane_size() {
             Err(ShmError::Refused { what }) => assert_eq!(what, reason),
             other => panic!("{:?}", other.map(|peer| peer.id())),
         }
-        // As a further segment of a session that is sound otherwise: refused, and for good.
+        // As a further segment of a valid session it is refused, permanently.
         let a = session();
         let peer = PeerSession::map(a.id(), a.descriptors().unwrap()).unwrap();
         let info = SegmentInfo { number: 1, kind: SegmentKind::Heap };
@@ -165,7 +165,7 @@ fn memory_that_is_handed_over_cannot_be_changed_by_its_receiver() {
         assert!(ftruncate(&fd, 0).is_err());
         assert!(rustix::io::write(&fd, b"x").is_err());
         assert!(fcntl_add_seals(&fd, SealFlags::WRITE).is_err());
-        // The map that the kernel allows at all is one that cannot write.
+        // The kernel permits a map of it, but not for writing.
         assert!(rustix::io::fcntl_getfd(&fd).unwrap().contains(rustix::io::FdFlags::CLOEXEC));
     }
 }
@@ -193,8 +193,8 @@ fn rings_that_make_no_sense_are_refused() {
 
 #[test]
 fn grants_that_make_no_sense_are_refused() {
-    // With 0 no reader would have the lane, and with the others a reader that still asks.
-    // Nor is one for an earlier or later reader with the same lane for this one.
+    // 0 would leave the lane without a reader. The values with the highest bit would leave it to a reader that still
+    // asks. The others are for an earlier or a later reader with the same lane.
     for generation in [0, 1 << 63, 1 << 63 | 1, u64::MAX, 2, 7 << 24, 7 << 24 | 2] {
         let mut hostile = HostileSession::new();
         hostile.generation = generation;
@@ -232,7 +232,7 @@ fn segments_of_others_versions_and_machines_are_refused_by_name() {
 fn sessions_that_make_no_sense_are_refused() {
     let a = session();
     assert!(PeerSession::map(SessionId::random(), a.descriptors().unwrap()).is_err());
-    // A publisher's segment is not another's, nor one for everybody.
+    // A publisher's segment cannot be announced as another publisher's or as one for objects.
     let writer = writer(&a, transient(keep_last(1)), 0);
     writer.publish(meta(0), &[0; 5000]).unwrap();
     let (info, fd) = a.segment(1).unwrap().unwrap();
@@ -242,8 +242,7 @@ fn sessions_that_make_no_sense_are_refused() {
         let peer = PeerSession::map(a.id(), a.descriptors().unwrap()).unwrap();
         assert!(peer.add_segment(SegmentInfo { number, kind }, &fd).is_err());
     }
-    // A process that rings a pipe or an eventfd could be made to wait, and one that rings a stream
-    // would send data to it.
+    // Ringing a pipe or an eventfd could block, and ringing a stream would send data to it.
     let flags = rustix::event::EventfdFlags::NONBLOCK;
     let socket = |family, kind| {
         let flags = rustix::net::SocketFlags::CLOEXEC;
@@ -276,7 +275,7 @@ fn control_words_that_make_no_sense_are_reported_and_stay_so() {
     for (tail, head) in [(0, huge), (5, 4), (huge, 0), (huge, huge), (0, 1 << 63)] {
         let hostile = HostileSession::new();
         let mut reader = hostile.map(0).unwrap();
-        // One that is late looks at them.
+        // A reader that lags reads tail and head.
         hostile.descriptor(SLOTS, 1, 0, 0);
         hostile.set_tail(tail);
         hostile.set_head(head);
@@ -301,7 +300,7 @@ fn a_head_that_goes_back_is_reported() {
 #[test]
 fn descriptors_in_places_that_make_no_sense_are_reported() {
     let mut words = vec![0, 1, 18, 30, 63, u64::MAX, !63 | 4];
-    // Behind the header's end but for the last line, before it, and beside it.
+    // The array would reach beyond the segment by all but one line, or begin in front of the objects, or outside.
     for offset in [0, 128, layout::SESSION_BYTES - 16 * 128 + 128, 1 << 40] {
         words.push((offset / 128) << 6 | 4);
     }
@@ -319,7 +318,7 @@ fn descriptors_in_places_that_make_no_sense_are_reported() {
             assert!(matches!(taken, Err(TakeError::Corrupt { .. })), "{word:x}");
         }
     }
-    // Of its own accord it is as good elsewhere.
+    // A publisher may move the array at any time; both of these locations are as good.
     let hostile = HostileSession::new();
     let mut reader = hostile.map(0).unwrap();
     hostile.descriptor(0, 1, 0, 0);
@@ -347,11 +346,11 @@ fn samples_in_places_that_make_no_sense_are_reported() {
         (1, 1, !127),
         (5000, 2, !127),
         (5000, 2, !0),
-        // In place, it may begin within a word.
+        // A sample in place may begin within a word.
         (5000, 2, end - 4999),
         (5000, 2, 0),
         (u32::MAX, 2, BLOCK),
-        // Too long to be copied, too short to be pinned, nowhere.
+        // A sample that is too long for a block, one that is too short for a slot, and one at an unknown kind of place.
         (4097, 1, BLOCK),
         (512, 2, BLOCK),
         (1, 3, BLOCK),
@@ -366,7 +365,7 @@ fn samples_in_places_that_make_no_sense_are_reported() {
         assert!(matches!(taken, Err(TakeError::Corrupt { .. })), "{len} {place} {data}");
         assert!(matches!(reader.take_sample(), Err(TakeError::Corrupt { .. })));
     }
-    // The same descriptor with what a publisher writes.
+    // The same descriptor with valid values.
     let hostile = HostileSession::new();
     let mut reader = hostile.map(0).unwrap();
     hostile.descriptor(0, 200, 1, end - 256);
@@ -389,7 +388,7 @@ fn a_segment_that_never_comes_holds_no_reader_for_ever() {
         (reader.missing(), reader.has_data(), reader.is_drained()),
         (Some(77), false, false)
     );
-    // The samples that are more recent and fill the depth are there.
+    // The newer samples, which fill the depth, can be taken.
     for position in 1..3 {
         hostile.descriptor(position, 1, 0, 0);
     }
@@ -409,7 +408,7 @@ fn descriptors_that_never_come_are_given_up_once_the_writer_is_gone() {
     assert_eq!((reader.missing(), reader.is_drained()), (Some(77), false));
     reader.end();
     let start = Instant::now();
-    // It is asked for again before it is given up.
+    // The reader requests it again before it gives it up.
     while reader.lost() == 0 {
         assert!(start.elapsed() < EVER, "it is hoped for without end");
         if reader.has_data() {

@@ -5,11 +5,11 @@ use std::{collections::VecDeque, thread};
 use super::*;
 use crate::qos::Reliability;
 
-/// `AXON_RING_BUFFER_SIZE_MB` and `AXON_MAX_MESSAGE_MB`, where nobody sets them.
+/// The defaults of `AXON_RING_BUFFER_SIZE_MB` and `AXON_MAX_MESSAGE_MB`.
 const BUDGET: u64 = 64 << 20;
 const MAX_MESSAGE: u64 = 256 << 20;
 
-/// Kept by a reader at most, while it takes the next.
+/// The most images that a reader keeps while it takes the next.
 const KEPT: usize = 2;
 
 fn create(session: &Arc<SessionSegment>, number: u32, qos: Qos) -> Writer {
@@ -29,7 +29,7 @@ fn attach_whole(
     reader
 }
 
-/// An image that says all over which one it is.
+/// Returns an image in which each part identifies it.
 fn image(canvas: &[u8], sequence: u64) -> Vec<u8> {
     let mut image = canvas.to_vec();
     for line in image.chunks_exact_mut(3840) {
@@ -43,8 +43,8 @@ fn check(sample: &Sample, canvas: &[u8], out: &mut Vec<u8>) {
     assert!(*out == image(canvas, sample.meta().sequence), "an image is torn");
 }
 
-/// Publishes images of `len` bytes to `count` readers of several sessions, which keep some and take
-/// the last there is, each on a thread of its own. Other topics of the same session go on.
+/// Publishes images of `len` bytes to `count` readers in several sessions. Each reader has a
+/// thread, keeps some images and takes the newest. Other topics of the same session go on.
 fn stream(count: usize, len: usize, total: u64, reliability: Reliability) {
     let qos = Qos { reliability, ..keep_last(1) };
     let a = session();

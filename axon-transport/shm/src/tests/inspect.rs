@@ -83,7 +83,7 @@ fn memory_comes_and_goes_with_descriptors_and_blocks() {
     assert!(counts(&ours, &writer).bytes < full);
 }
 
-/// More samples than the first segment of a session has room for.
+/// More samples than fit in the first segment of a session.
 const MANY: u64 = 2048;
 
 #[test]
@@ -100,7 +100,7 @@ fn history_dropped_for_lack_of_memory_is_counted() {
     let gone = MANY - (ring.standing.1 - ring.standing.0);
     assert!(gone > 0, "{ring:?}");
     assert_eq!((ring.blocked, ring.no_memory), (0, gone), "{ring:?}");
-    // The same of blocks, where there is none for another sample.
+    // The same for blocks, if there is none for another sample.
     for sequence in ring.standing.1 + 1..=10_000 {
         writer.publish(meta(sequence), &pattern(sequence, 1000)).unwrap();
     }
@@ -134,7 +134,7 @@ fn a_reader_is_not_blamed_where_memory_is_short() {
     let (mut last, mut failed) = (0, 0);
     for len in [8, 1000, 8000] {
         let (before, mut taken) = (last, 0);
-        // There is memory for samples of this length, and then no more of it.
+        // There is memory for samples of this length; then there is no more.
         available::PRETENDED.set(None);
         last += 1;
         writer.publish(meta(last), &pattern(last, len)).unwrap();

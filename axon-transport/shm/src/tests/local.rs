@@ -150,7 +150,7 @@ fn a_reader_deeper_than_the_publisher_widens_its_window() {
 #[test]
 fn samples_beyond_the_budget_are_counted_as_lost() {
     let (a, b) = (session(), session());
-    // Room for eight samples of 4 KiB in a window of 50.
+    // The budget holds eight samples of 4 KiB; the window would hold 50.
     let writer = writer(&a, keep_last(50), 8 * 4096);
     let mut reader = attach(&writer, &a, &b, keep_last(50));
     for sequence in 0..100 {
@@ -201,9 +201,9 @@ fn keep_all_holds_the_publisher_until_a_sample_is_taken() {
         sequence += 1;
     }
     assert_eq!(lagging.lost(), 0);
-    // The other reader did not hold anybody, and loses nothing that its depth asks for.
+    // The other reader did not hold up the publisher, and loses nothing within its depth.
     assert_eq!(take(&mut paused).unwrap().0, sequence - 10);
-    // One that leaves holds nobody any more.
+    // A reader that has left does not hold up the publisher.
     drop(lagging);
     writer.try_publish(meta(sequence), &pattern(sequence, 1024)).unwrap();
 }
@@ -284,7 +284,7 @@ fn attaching_again_changes_only_the_subscriptions_a_relay_represents() {
     info.stands_for = Some(relayed.clone());
     assert_eq!(writer.attach(info.clone()).unwrap(), grant);
     assert_eq!((writer.readers(), writer.reader_count()), (relayed.clone(), relayed.len()));
-    // Another lane is another attachment.
+    // A request with another lane is another attachment.
     info.lane = lanes[1].location();
     let other = writer.attach(info.clone()).unwrap();
     assert_ne!(other.generation, grant.generation);
@@ -322,7 +322,8 @@ fn a_stale_lane_grant_is_refused() {
     let reader = attach(&writer, &a, &b, keep_last(1));
     let (before, grant) = (reader.lane(), reader.grant());
     drop(reader);
-    // Its publisher has not looked since, and would take the next reader for it.
+    // The publisher has not read the lane since, and could mistake the next reader for the earlier
+    // one.
     let lane = b.allocate_lane().unwrap();
     assert_eq!(lane.location(), before);
     let options = ReaderOptions {
@@ -396,7 +397,7 @@ fn an_overtaken_reader_never_sees_a_torn_sample() {
         let mut last = None;
         while last != Some(total - 1) {
             await_data(&b, &reader);
-            // None when it was overtaken time and again.
+            // `None` if the publisher overtook the reader again and again.
             let Some((sequence, payload)) = take(&mut reader) else { continue };
             assert_eq!(payload, pattern(sequence, payload.len()));
             assert!(last < Some(sequence));
@@ -452,7 +453,7 @@ fn a_relay_attached_later_owes_no_earlier_samples() {
         stands_for: Some(vec![gid]),
     };
     assert_eq!(writer.attach(info).unwrap().first, 3);
-    // Somebody has waited since the first of the three.
+    // A thread that waits may pass the head of an earlier time, from before the relay attached.
     let delivered_up_to = |published| writer.lock().reader_set.delivered_up_to(published);
     assert_eq!([1, 3, 4].map(delivered_up_to), [1, 3, 3]);
 }

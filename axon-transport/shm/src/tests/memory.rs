@@ -8,7 +8,7 @@ use super::*;
 
 mod budget;
 
-/// A reader in another session that is told of segments only by [`hand`].
+/// Attaches a reader in another session that receives segments only through [`hand`].
 fn attach_untold(
     writer: &Writer,
     publisher: &Arc<SessionSegment>,
@@ -19,7 +19,7 @@ fn attach_untold(
     attach_untold_with(descriptors, writer, publisher, reader, qos)
 }
 
-/// The same, of a publisher's session with these descriptors.
+/// Like [`attach_untold`], with these descriptors of the publisher's session.
 fn attach_untold_with(
     descriptors: PeerDescriptors,
     writer: &Writer,
@@ -91,12 +91,12 @@ fn keep_all_grows_to_its_limit_and_then_holds() {
     assert_eq!((take(&mut reader), reader.lost()), (None, 0));
 }
 
-/// KEEP_ALL, and all of it for those that come later.
+/// KEEP_ALL, with all samples for late joiners.
 fn keep_all_for_later() -> Qos {
     Qos { durability: Durability::TransientLocal, ..Qos::keep_all() }
 }
 
-/// Publishes `total` samples of `len` bytes, and returns what a reader gets that comes then.
+/// Publishes `total` samples of `len` bytes, and returns the number that a late joiner gets.
 fn late_reader_gets(budget: u64, total: u64, len: usize) -> u64 {
     let (a, b) = (session(), session());
     let writer = writer(&a, keep_all_for_later(), budget);
@@ -105,7 +105,7 @@ fn late_reader_gets(budget: u64, total: u64, len: usize) -> u64 {
     let mut taken = 0;
     while let Some(sequence) = take(&mut late) {
         taken += 1;
-        // The newest are all there.
+        // No sample is missing among the newest.
         assert_eq!(sequence + late.unread(), total - 1);
     }
     assert_eq!(late.lost(), 0);
@@ -115,10 +115,10 @@ fn late_reader_gets(budget: u64, total: u64, len: usize) -> u64 {
 #[test]
 fn history_for_late_readers_is_bounded_by_bytes() {
     assert_eq!(late_reader_gets(64 << 20, 20_000, 64), 20_000);
-    // A descriptor of 128 bytes each.
+    // Each sample takes a descriptor of 128 bytes.
     assert_eq!(late_reader_gets(4 << 20, 200_000, 64), (4 << 20) / 128);
     assert_eq!(late_reader_gets(3 << 20, 200_000, 64), (3 << 20) / 128);
-    // And a block of 256.
+    // Each sample also takes a block of 256 bytes.
     assert_eq!(late_reader_gets(3 << 20, 50_000, 200), (3 << 20) / 384);
     assert_eq!(late_reader_gets(64 << 20, 600_000, 88), (64 << 20) / 128);
 }
@@ -169,7 +169,7 @@ fn an_overtaken_reader_counts_right_while_the_ring_grows() {
     let (a, b) = (session(), session());
     let writer = writer(&a, keep_last(1), 1 << 20);
     let total = 30_000;
-    // The readers that come make it grow, while the first is at it.
+    // The readers that attach make the ring grow while the first one reads.
     let mut first = attach(&writer, &a, &b, keep_last(3));
     std::thread::scope(|scope| {
         scope.spawn(|| {
@@ -193,8 +193,8 @@ fn an_overtaken_reader_counts_right_while_the_ring_grows() {
     assert!(descriptors(&writer) >= 8192);
 }
 
-/// Has a publisher with `offered` fill its first segment for a reader that takes each sample at once and cannot follow,
-/// beside one that takes none and has a depth of 1. The ring stays where the first one reads it.
+/// Makes a publisher with `offered` fill its first segment. One reader takes each sample at once and does not receive
+/// further segments; another takes none and has a depth of 1. Checks that the ring stays where the first one reads it.
 fn ring_stays_in_its_segment(offered: Qos, wanted: Qos) {
     let (a, b) = (silent_session(), session());
     let writer = writer(&a, offered, 64 << 20);
@@ -207,7 +207,7 @@ fn ring_stays_in_its_segment(offered: Qos, wanted: Qos) {
         assert_eq!(take(&mut reader), Some(sequence));
     }
     if start.elapsed() > Duration::from_millis(900) {
-        // So slow a host lets it move all the same.
+        // On such a slow host the ring may move in spite of that.
         return;
     }
     assert_eq!(idle.received(), 0);
@@ -329,11 +329,11 @@ fn memory_of_a_dead_process_that_never_comes_is_waited_for_once() {
     process.wait().unwrap();
     let descriptors = PeerDescriptors { pidfd, ..a.descriptors().unwrap() };
     let (mut reader, from) = attach_untold_with(descriptors, &writer, &a, &b, Qos::keep_all());
-    // The short one is in memory that is there.
+    // The short sample is in memory that the reader has.
     for (sequence, length) in [(0, 5000), (1, 10), (2, 5000)] {
         publish(&writer, sequence, length);
     }
-    // How often the reader asks for the memory of a sample, until it gives it up.
+    // Returns how often the reader asks for the memory of a sample before it gives the sample up.
     let asks = |reader: &mut Reader, lost| {
         let mut times = 0;
         while reader.lost() < lost {
@@ -373,7 +373,7 @@ fn a_sample_whose_memory_has_not_come_waits_for_it() {
     let sample = reader.take_sample().unwrap().unwrap();
     assert!(sample.is_borrowed());
     assert_eq!(take(&mut reader), Some(2));
-    // It is given up; what is in use stays.
+    // The publisher gave the segment up; memory in use stays mapped.
     from.remove_segment(1);
     drop(writer);
     let mut out = Vec::new();
@@ -408,7 +408,7 @@ fn an_unread_sample_costs_a_number_and_no_memory() {
     assert_eq!(published.position, None);
     assert_eq!(publisher.skip_unread(), Ok(Some(52)));
     assert!(a.segments().is_empty(), "no memory for large samples");
-    // A loan that nobody reads goes back.
+    // A loan that nobody reads returns its memory.
     for number in 53..100 {
         let mut loan = publisher.loan(MAX as usize).unwrap();
         loan.fill(1);

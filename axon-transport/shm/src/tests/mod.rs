@@ -44,8 +44,8 @@ use crate::{
 };
 
 const MAX: u64 = 1 << 20;
-/// Only a wake-up that was lost takes this long: a wait that it ends has looked once more, and may
-/// have found what it was not woken for.
+/// Only a lost wake-up makes a wait take this long. Such a wait checks once more when it ends, so
+/// its result does not show that it was not woken.
 const EVER: Duration = Duration::from_secs(60);
 
 /// Runs a wait of up to [`EVER`], which must end because it is woken.
@@ -54,7 +54,7 @@ fn woken(wait: impl FnOnce() -> bool) {
     assert!(wait() && start.elapsed() < EVER, "a wake-up was lost");
 }
 
-/// Takes the next sample: its number and payload.
+/// Takes the next sample, and returns its number and payload.
 fn take(reader: &mut Reader) -> Option<(u64, Vec<u8>)> {
     let mut out = Vec::new();
     reader.take(&mut out).unwrap().map(|taken| {
@@ -74,7 +74,7 @@ fn session() -> Arc<SessionSegment> {
     session
 }
 
-/// A session that tells nobody of its segments.
+/// A session that announces no segments.
 fn silent_session() -> Arc<SessionSegment> {
     SessionSegment::create(SessionId::random()).unwrap()
 }
@@ -93,15 +93,15 @@ fn writer(session: &Arc<SessionSegment>, qos: Qos, budget: u64) -> Writer {
     Writer::create(session.clone(), options).unwrap()
 }
 
-/// Those who see a session, to be told of its segments.
+/// The views of sessions, which receive the announcements of segments.
 static VIEWS: Mutex<Vec<Weak<PeerSession>>> = Mutex::new(Vec::new());
 
-/// How `of` looks to `from`.
+/// Returns the session `of` as `from` sees it.
 fn peer(from: &SessionSegment, of: &Arc<SessionSegment>) -> RingPeer {
     if from.id() == of.id() { RingPeer::Local(of.clone()) } else { RingPeer::Remote(view(of)) }
 }
 
-/// How a session looks to another that is told of its segments, as a daemon would.
+/// Maps a session, and announces its segments to the view as a daemon would.
 fn view(of: &SessionSegment) -> Arc<PeerSession> {
     let view = PeerSession::map(of.id(), of.descriptors().unwrap()).unwrap();
     VIEWS.lock().unwrap().push(Arc::downgrade(&view));
@@ -126,7 +126,7 @@ fn tell_views(of: SessionId, event: SegmentEvent<'_>) {
     }
 }
 
-/// A subscription in `reader` on a publisher in `publisher`.
+/// Attaches a subscription of session `reader` to a publisher of session `publisher`.
 fn attach(
     writer: &Writer,
     publisher: &Arc<SessionSegment>,
@@ -136,7 +136,7 @@ fn attach(
     attach_to(writer, publisher, reader, peer(reader, publisher), qos)
 }
 
-/// As [`attach`], where `from` is how the reader's session sees the publisher's.
+/// Like [`attach`]; `from` is the publisher's session as the reader's session sees it.
 fn attach_to(
     writer: &Writer,
     publisher: &Arc<SessionSegment>,
@@ -172,7 +172,7 @@ fn meta(sequence: u64) -> Meta {
     Meta::at_nanos(sequence, sequence.cast_signed() * 7 - 3)
 }
 
-/// Bytes that differ by sequence number and place.
+/// Returns bytes that differ by sequence number and offset.
 fn pattern(sequence: u64, len: usize) -> Vec<u8> {
     let mut state = sequence.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
     let mut bytes = Vec::with_capacity(len + 8);
@@ -186,7 +186,8 @@ fn pattern(sequence: u64, len: usize) -> Vec<u8> {
     bytes
 }
 
-/// The lengths at which something changes: none, inline, words, granules, pages, powers of two.
+/// Returns the lengths at which the handling changes: none, inline, words, granules, pages, powers
+/// of two.
 fn lengths() -> Vec<usize> {
     let around = (3..=18).flat_map(|power| [(1 << power) - 1, 1 << power, (1 << power) + 1]);
     (0..=200).chain(around).collect()

@@ -10,7 +10,7 @@ use std::{
 
 use crate::sync::Site;
 
-/// The model that catches each.
+/// Returns the model that fails if the site is weakened.
 fn caught_by(site: Site) -> &'static str {
     use Site::*;
     match site {

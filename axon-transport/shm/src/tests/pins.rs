@@ -32,7 +32,8 @@ fn intact(sample: &Sample) {
     assert!(bytes == pattern(sequence, sample.len()), "sample {sequence} changed");
 }
 
-/// Samples that the publisher has given up, whose memory it has not used since.
+/// Returns the number of samples that the publisher has given up and whose memory it has not
+/// reused.
 fn retired(writer: &Writer) -> usize {
     writer.lock().history.pinned().retired().len()
 }
@@ -136,14 +137,14 @@ fn bytes_after_a_header_are_aligned_for_writer_and_readers() {
         let count = sample.read_at(at, &mut part);
         assert_eq!(part[..count], bytes[at..][..count]);
         assert_eq!(count, 40.min(len - at));
-        // SAFETY: the writer is this test's, and does not write to what is pinned.
+        // SAFETY: the writer belongs to this test, and does not write to pinned samples.
         assert_eq!(unsafe { sample.as_slice() }, bytes);
         assert_eq!(sample.read_at(len, &mut part) + sample.read_at(usize::MAX, &mut part), 0);
         let mut copy = Vec::new();
         readers[1].take(&mut copy).unwrap().unwrap();
         assert_eq!(copy, bytes);
     }
-    // As much is given back as was lent.
+    // Dropping a loan releases as many bytes as were lent.
     (0..100).for_each(|_| drop(writer.loan_behind(4, MAX as usize).unwrap()));
 }
 
@@ -159,7 +160,7 @@ fn a_slot_longer_than_its_sample_is_kept_as_long() {
             let patience = PublishDeadline::new(Duration::ZERO);
             loan.commit(len, Numbering::Given(meta(sequence)), patience).unwrap();
         };
-        // The later they come, the shorter is what they may keep in place.
+        // Each later reader may pin only shorter samples.
         let mut kept = 0;
         for (reader, len) in (0..20).flat_map(|at| (13..21).map(move |power| (at, 1 << power))) {
             let reader: &mut Reader = &mut readers[reader];
@@ -184,11 +185,11 @@ fn nothing_that_ends_ends_a_sample_in_use() {
     let sample = take(&mut reader);
     let (lane, gid) = (reader.lane(), writer.readers()[0]);
 
-    // The daemon, or another caller of `detach`, unmatches the two.
+    // The daemon, or another caller of `detach`, detaches the reader.
     assert!(writer.detach(gid));
     (1..50).for_each(|sequence| publish(&writer, sequence, LARGE));
     intact(&sample);
-    // The subscription ends, and its session goes with it.
+    // The subscription ends, and with it its session.
     drop(reader);
     assert_ne!(b.allocate_lane().unwrap().location(), lane, "the lane is in use");
     drop(b);
@@ -239,7 +240,7 @@ fn the_sixth_sample_in_use_is_a_copy() {
 #[test]
 fn samples_in_use_hold_no_publisher() {
     let (a, b) = (session(), session());
-    // At depth one, with the largest samples.
+    // The depth is one, and the samples are the largest.
     let last = writer(&a, keep_last(1), 0);
     let mut reader = attach(&last, &a, &b, keep_last(1));
     let mut other = attach(&last, &a, &b, keep_last(1));
@@ -253,7 +254,7 @@ fn samples_in_use_hold_no_publisher() {
         intact(&take(&mut other));
     }
     kept.iter().for_each(intact);
-    // KEEP_ALL: taken is taken.
+    // With KEEP_ALL, a sample that was taken holds nobody up.
     let all = writer(&a, Qos::keep_all(), 4 * LARGE as u64);
     let mut reader = attach(&all, &a, &b, Qos::keep_all());
     let mut kept = Vec::new();
@@ -268,7 +269,7 @@ fn samples_in_use_hold_no_publisher() {
 #[test]
 fn memory_that_readers_keep_is_named_and_comes_back() {
     const LEN: usize = 1 << 16;
-    // The publisher's own session may keep what it likes.
+    // Readers in the publisher's own session may pin everything.
     let a = session();
     let (gid, max_message) = (Gid::new(a.id(), 1), LEN as u64);
     let options = RingOptions { gid, qos: keep_last(1), budget: 0, max_message, expected: 0 };
@@ -295,7 +296,7 @@ fn memory_that_readers_keep_is_named_and_comes_back() {
     let named = format!("reader {} (pid {}) holds", keeper.reader, std::process::id());
     assert!(error.to_string().contains(&named), "{error}");
     kept.iter().for_each(intact);
-    // Small ones need none of it.
+    // Small samples need none of this memory.
     publish(&writer, sequence, 4096);
     kept.clear();
     publish(&writer, sequence + 1, LEN);
@@ -308,7 +309,8 @@ fn pins_of_other_processes_leave_room_for_the_publisher() {
     let (gid, max_message) = (Gid::new(a.id(), 1), LEN as u64);
     let options = RingOptions { gid, qos: keep_last(1), budget: 0, max_message, expected: 0 };
     let writer = Writer::create(a.clone(), options).unwrap();
-    // One half keeps to the protocol, and as much as it can; the other pins whatever there is.
+    // One half of the readers keeps to the protocol and pins as much as it may; the other half pins
+    // everything.
     let pair = || [(); 2].map(|()| attach(&writer, &a, &b, keep_last(1))).into();
     let (mut readers, hostile): (Vec<_>, Vec<_>) = (0..100).map(|_| -> (_, _) { pair() }).unzip();
     let view = peer(&b, &b);
@@ -333,7 +335,7 @@ fn a_sample_that_may_not_be_pinned_is_copied_whole_or_not_at_all() {
     const LEN: usize = MAX as usize;
     let (a, b) = (session(), session());
     let writer = writer(&a, keep_last(1), 0);
-    // Made before, so that the publisher is faster than the reader.
+    // Created in advance, so that the publisher is faster than the reader.
     let payloads: Vec<_> = (0..4).map(|number| pattern(number, LEN)).collect();
     let payload = |sequence: u64| &payloads[sequence as usize % 4];
     let _others = [(); 2].map(|()| attach(&writer, &a, &b, keep_last(1)));
@@ -474,7 +476,7 @@ fn a_lane_that_passes_on_unseen_is_another_attachment() {
     };
     let before = writer.attach(info.clone()).unwrap();
     publish(&writer, 0, 10);
-    // Opened, closed, given to the next reader: the publisher looks only now.
+    // The lane is opened, closed and given to the next reader before the publisher reads it.
     lane.open(before, info.gid);
     drop(lane);
     let lane = b.allocate_lane().unwrap();

@@ -14,8 +14,8 @@ fn large_writer(session: &Arc<SessionSegment>, qos: Qos, budget: u64) -> Writer 
     Writer::create(session.clone(), options).unwrap()
 }
 
-/// Publishes whatever it takes: a host under load may keep a reader from running for longer than
-/// a publish waits.
+/// Publishes a sample, and retries as long as necessary: on a loaded host a reader may not run for longer than a
+/// publish waits.
 fn publish(writer: &Writer, sequence: u64, payload: &[u8]) {
     while let Err(error) = writer.publish(meta(sequence), payload) {
         assert!(matches!(error, PublishError::Blocked { .. }), "{error}");
@@ -35,7 +35,7 @@ fn take(reader: &mut Reader, session: &SessionSegment, out: &mut Vec<u8>) -> u64
     }
 }
 
-/// Not a test of its own: what the other process does.
+/// The code of the other process; not a test of its own.
 #[test]
 fn the_other_process() {
     let Ok(part) = env::var(PART) else { return };
@@ -88,7 +88,7 @@ fn the_other_process() {
                 assert!(out == pattern(sequence, out.len()), "sample {sequence} is torn");
             }
             wire.send_numbers(&[subscriber.received(), subscriber.lost()]);
-            // The publisher goes away, which ends the wait.
+            // The wait ends when the publisher is gone.
             assert!(subscriber.recv(None).unwrap().is_none() && subscriber.publisher_ended());
         }
         "publish and go" => {
@@ -112,7 +112,7 @@ fn the_other_process() {
                 kept.push(reader.take_sample().unwrap().expect("the only one"));
                 wire.send_numbers(&[]);
             }
-            // Asked what they hold, again and again.
+            // Reports its samples each time that the test asks.
             while !wire.receive().0.is_empty() {
                 for sample in &kept {
                     assert!(sample.is_borrowed());
@@ -126,7 +126,7 @@ fn the_other_process() {
             let writer = large_writer(&session, keep_last(2), 1 << 20);
             wire.serve(&session, &writer, keep_last(2));
             for sequence in 0.. {
-                // In steps, so that a kill in the middle of a sample is likely.
+                // In steps, so that a kill is likely in the middle of a sample.
                 let payload = pattern(sequence, 100_000);
                 let mut loan = writer.loan(payload.len()).unwrap();
                 for piece in payload.chunks(1000) {
@@ -143,15 +143,15 @@ fn the_other_process() {
             let kept = reader.take_sample().unwrap().unwrap();
             let loan = writer.loan(9000).unwrap();
             writer.publish(meta(0), b"before").unwrap();
-            // SAFETY: the child makes no call but what follows, which takes no lock that another
-            // thread may have held, and leaves by _exit.
+            // SAFETY: the child only makes the following calls, which take no lock that another thread may have held,
+            // and leaves by _exit.
             let child = unsafe { libc::fork() };
             if child == 0 {
                 let poisoned = writer.publish(meta(1), b"child") == Err(PublishError::Forked)
                     && kept.read_at(0, &mut [0; 8]) == 0
                     && writer.readers().is_empty()
                     && reader.take(&mut out) == Err(TakeError::Forked)
-                    // The publisher's memory is not there, as it is of the same session.
+                    // The child does not have the publisher's memory, because the publisher is of the same session.
                     && !reader.has_data()
                     && (reader.unread(), reader.is_drained()) == (0, true)
                     && matches!(session.allocate_lane(), Err(ShmError::Forked))
@@ -165,7 +165,7 @@ fn the_other_process() {
             // SAFETY: waits for the child just made; `status` outlives the call.
             assert_eq!(unsafe { libc::waitpid(child, &mut status, 0) }, child);
             assert_eq!(status, 0, "the child was refused, and killed by nothing");
-            // The parent goes on as if nothing had been.
+            // The parent is not affected.
             for sequence in 8..40 {
                 writer.publish(meta(sequence), &pattern(sequence, 9000)).unwrap();
                 reader.take(&mut out).unwrap().unwrap();
@@ -183,11 +183,11 @@ fn the_other_process() {
             let mut loan = writer.loan(9000).unwrap();
             let slice: &mut [u8] = &mut loan;
             let page = (slice.as_mut_ptr() as usize & !4095) as *mut libc::c_void;
-            // SAFETY: the child makes system calls and one store.
+            // SAFETY: the child only makes system calls and one store.
             let child = unsafe { libc::fork() };
             if child == 0 {
                 let flags = libc::MAP_PRIVATE | libc::MAP_ANONYMOUS | libc::MAP_FIXED_NOREPLACE;
-                // SAFETY: it replaces nothing.
+                // SAFETY: the call replaces no mapping.
                 let found = unsafe { libc::mmap(page, 4096, libc::PROT_READ, flags, -1, 0) };
                 if found == page {
                     // SAFETY: ends the process without running anything else.
@@ -214,7 +214,7 @@ fn the_other_process() {
                 assert_eq!(take(&mut ping, &session, &mut out), sequence);
                 publish(&writer, sequence, &out);
             }
-            // The last one must be read before this process goes.
+            // The last sample must be read before this process ends.
             wire.receive();
         }
         other => panic!("no such part: {other}"),
@@ -240,7 +240,7 @@ fn each_length_crosses() {
 #[test]
 fn keep_all_loses_nothing_to_a_slow_reader() {
     let session = session();
-    // Room for 64 samples.
+    // The ring holds 64 samples.
     let writer = large_writer(&session, Qos::keep_all(), 64 * 1024);
     let other = Other::start("take all");
     other.wire.serve(&session, &writer, Qos::keep_all());
@@ -270,7 +270,7 @@ fn the_largest_message_crosses_at_depth_one() {
 #[test]
 fn missed_samples_of_a_keep_last_reader_are_counted() {
     let session = session();
-    // Room for eight samples, of which the reader would like 20.
+    // The ring holds eight samples; the reader's depth is 20.
     let writer = large_writer(&session, keep_last(1), 8 * 1024);
     let other = Other::start("take what is there at the end");
     other.wire.serve(&session, &writer, keep_last(20));
@@ -311,7 +311,7 @@ fn a_reader_killed_while_it_holds_the_publisher_lets_it_go() {
 
 #[test]
 fn two_processes_need_no_daemon() {
-    // The one publishes and goes, the other takes it all and finds that the first has gone.
+    // One process publishes and ends; the other takes all samples and detects the end.
     let (publisher, subscriber) = (Other::start("publish and go"), Other::start("subscribe"));
     for (from, to) in [(&subscriber, &publisher), (&publisher, &subscriber)] {
         from.wire.pass_on(&to.wire);
@@ -322,7 +322,7 @@ fn two_processes_need_no_daemon() {
     subscriber.succeed();
 }
 
-/// A reader's process that keeps five samples, and their publisher.
+/// Starts the process of a reader that keeps five samples, and creates their publisher.
 fn keeper(session: &Arc<SessionSegment>) -> (Other, Writer) {
     let writer = large_writer(session, keep_last(1), 0);
     let other = Other::start("keep samples");
@@ -359,7 +359,7 @@ fn samples_pinned_by_another_process_are_not_overwritten() {
     assert!((5..=7).contains(&retired(&writer)));
     other.wire.send(b"", &[]);
     other.succeed();
-    // Its process has ended: it told us, or we find out.
+    // Its process has ended: the publisher is told or finds out.
     writer.drop_dead();
     (0..4).for_each(|n| publish(&writer, 1000 + n, &pattern(1000 + n, KEPT)));
     assert!(retired(&writer) <= 1);
@@ -372,7 +372,7 @@ fn a_process_killed_with_samples_in_use_gives_them_back() {
     let large = |sequence| {
         writer.try_publish(meta(sequence), &pattern(sequence, KEPT)).unwrap();
     };
-    // One that is stopped is as good as alive, and holds nobody up.
+    // A stopped process counts as alive, and does not hold up the publisher.
     let pid = rustix::process::Pid::from_child(&other.child);
     rustix::process::kill_process(pid, rustix::process::Signal::STOP).unwrap();
     (5..200).for_each(large);
@@ -416,7 +416,7 @@ fn a_publisher_killed_in_the_middle_of_a_sample_leaves_no_torn_one() {
         assert!(!reader.writer_dead());
         other.kill();
         assert!(reader.writer_dead());
-        // What it published before stands and is drained.
+        // The samples that it published before are drained.
         while reader.has_data() {
             take(&mut reader, &session, &mut out);
         }

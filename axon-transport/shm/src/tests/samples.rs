@@ -11,20 +11,20 @@ use crate::{TrustPublishers, alloc::retention::IDLE};
 
 const IMAGE: usize = 200_000;
 
-/// Segments of large samples that a session has.
+/// Returns the segments of large samples that a session has.
 fn samples_of(session: &SessionSegment) -> Vec<(SegmentInfo, OwnedFd)> {
     let samples = |info: &SegmentInfo| matches!(info.kind, SegmentKind::Samples(_));
     let live = session.segments().into_iter().filter(samples);
     live.map(|info| session.segment(info.number).unwrap().unwrap()).collect()
 }
 
-/// Bytes that are backed by memory.
+/// Returns the number of bytes that are backed by memory.
 fn backed(session: &SessionSegment) -> u64 {
     let blocks = |fd: &OwnedFd| fstat(fd).unwrap().st_blocks.cast_unsigned() * 512;
     samples_of(session).iter().map(|(_, fd)| blocks(fd)).sum()
 }
 
-/// Whether this process maps or holds any of the files, by their inodes.
+/// Returns whether this process maps or holds any of these files, by inode.
 fn exists(inodes: &[u64]) -> bool {
     let maps = fs::read_to_string("/proc/self/maps").unwrap();
     let mapped = |line: &str| {
@@ -33,7 +33,7 @@ fn exists(inodes: &[u64]) -> bool {
     };
     let held = |entry: std::io::Result<fs::DirEntry>| {
         use std::os::unix::fs::MetadataExt;
-        // One may be closed meanwhile by another test.
+        // Another test may close one meanwhile.
         let file = entry.ok().and_then(|entry| fs::metadata(entry.path()).ok());
         file.is_some_and(|file| inodes.contains(&file.ino()))
     };
@@ -54,7 +54,7 @@ fn whole(sample: &Sample) {
     assert!(out == pattern(sample.meta().sequence, sample.len()), "a sample changed");
 }
 
-/// Looks after the writer as a control thread does, for the given seconds from `from` on.
+/// Reclaims the writer's memory like a control thread, for the given number of seconds after `from`.
 fn reclaim_idle(writer: &Writer, from: Instant, seconds: u64) -> bool {
     (0..=seconds)
         .map(|second| writer.reclaim_idle(from + Duration::from_secs(second)))
@@ -86,7 +86,7 @@ fn sizes_from_nothing_to_the_largest_share_a_topic() {
         assert_eq!(reader.received() + reader.skipped() + reader.lost(), 600);
         assert_eq!(reader.lost(), 0, "the budget is never short");
     }
-    // What stands is at most the budget, and four of the largest are beside it.
+    // The kept samples take at most the budget, and four of the largest fit beside them.
     assert!(backed(&a) <= (4 << 20) + 5 * MAX, "{} bytes", backed(&a));
 }
 
@@ -118,7 +118,7 @@ fn memory_that_is_not_used_any_more_comes_back() {
     assert!(!reclaim_idle(&writer, start + Duration::from_secs(122), 30), "nothing is left");
     assert_eq!(backed(&a), 0);
     assert!(!exists(&inodes), "neither its publisher nor its reader keeps it");
-    // And it comes when it is needed again.
+    // Memory is allocated again when it is needed.
     publish(&writer, 20, IMAGE);
     whole(&reader.take_sample().unwrap().expect("a sample"));
     assert_eq!((reader.lost(), samples_of(&a).len()), (0, 1));
@@ -170,7 +170,7 @@ fn samples_taken_by_all_readers_are_overwritten_first() {
         readers.iter_mut().for_each(|reader| whole(&reader.take_sample().unwrap().unwrap()));
     }
     assert!(backed(&a) < 6 * IMAGE as u64, "{} bytes", backed(&a));
-    // A reader that is late has its history all the same.
+    // A reader that lags still gets its history.
     for sequence in 100..110 {
         publish(&writer, sequence, IMAGE);
         readers[0].take_sample().unwrap().unwrap();
@@ -234,7 +234,7 @@ fn readers_that_keep_all_they_can_are_given_way_and_named_at_the_end() {
     let writer = writer(&a, keep_last(1), 0);
     let mut kept = Vec::new();
     let mut sequence = 0;
-    // More than the first segment has room for, of which their own session may keep all.
+    // More samples than fit in the first segment. Readers of the publisher's own session may pin all of them.
     for _ in 0..8 {
         let mut reader = attach(&writer, &a, &a, keep_last(1));
         for _ in 0..5 {
@@ -267,11 +267,11 @@ fn nothing_is_given_up_for_a_sample_that_there_is_no_memory_for() {
         assert_eq!(sequences, expected);
     };
     available::PRETENDED.set(Some(0));
-    // The budget is full, so that all but one would go for it.
+    // The budget is full, so all samples except one would have to be dropped.
     let refused = writer.loan(MAX as usize).map(drop);
     assert!(matches!(refused, Err(PublishError::NoMemory { .. })), "{refused:?}");
     standing(&[0, 1, 2, 3, 4]);
-    // What stands makes room for its like.
+    // The kept samples make room for a sample of the same length.
     publish(&writer, 5, IMAGE);
     publish(&writer, 6, IMAGE);
     standing(&[2, 3, 4, 5, 6]);
@@ -286,7 +286,7 @@ fn a_sample_evicted_before_its_memory_arrived_does_not_block_readers() {
     publish(&writer, 0, IMAGE);
     assert!(reader.take_sample().unwrap().is_none(), "its memory has not come");
     assert!(!reader.has_data() && reader.missing().is_some());
-    // The budget holds no more: the large one goes, and its memory with it.
+    // The budget is full: the large sample is dropped, and its memory with it.
     publish(&writer, 1, 1000);
     publish(&writer, 2, 1000);
     assert!(!reclaim_idle(&writer, Instant::now(), 20));
@@ -332,9 +332,9 @@ fn a_subscriber_in_its_publishers_context_is_sent_nothing() {
     assert_eq!(error.kind(), std::io::ErrorKind::WouldBlock);
 }
 
-/// Of the publishers of this test.
+/// Trusts the publishers of this test.
 fn trust() -> TrustPublishers {
-    // SAFETY: they are of this crate, and a child that a test forks uses no slice that was borrowed before.
+    // SAFETY: the publishers use this crate, and no forked child of a test uses a slice that was borrowed before.
     unsafe { TrustPublishers::new() }
 }
 
@@ -387,7 +387,7 @@ fn bytes_that_are_not_done_with_are_told_of_taken_samples_too() {
     let mut reader = attach(&writer, &a, &b, Qos::keep_all());
     reader.finish_later();
     assert_eq!(reader.undone_bytes(), 0);
-    // In the descriptor, in a block, and in a place of its own.
+    // An inline sample, a sample in a block, and samples in slots.
     for (sequence, len) in (1..).zip([10, 2000, 9000, 5000]) {
         writer.publish(meta(sequence), &pattern(sequence, len)).unwrap();
     }

@@ -28,7 +28,7 @@ fn at_once(socket: &impl AsFd) -> ConnectChannel<'_> {
     ConnectChannel::new(socket.as_fd(), Some(Duration::ZERO))
 }
 
-/// A subscriber of a publisher that tells it nothing, and the line over which the test may.
+/// Creates a subscriber whose publisher announces nothing, and the line over which the test may.
 fn untold(
     (session, writer): (&Arc<SessionSegment>, &Writer),
     context: &Context,
@@ -128,7 +128,7 @@ fn withdrawn_segments_do_not_fill_an_unread_channel() {
     };
     let (packets, _) = drain();
     assert!((1..50).contains(&packets), "{packets} packets stood in the line");
-    // In the end it knows that all are gone.
+    // Finally the subscriber learns that all segments are gone.
     let start = Instant::now();
     while drain().1 > 0 {
         assert!(start.elapsed() < EVER);
@@ -172,7 +172,7 @@ fn memory_of_a_publisher_that_is_gone_is_let_go_of() {
 fn memory_of_an_unread_publisher_is_unmapped_while_own_samples_are_read() {
     let (here, there) = contexts();
     let (ours, theirs) = (publisher(&here, keep_last(1)), publisher(&there, keep_last(1)));
-    // The other way round.
+    // A connection in the other direction.
     let _back = together(&theirs, &here, keep_last(1)).1.unwrap();
     let mut readers = [(); 2].map(|()| together(&ours, &there, keep_last(1)).1.unwrap());
     let mut take = |reader: &mut Subscriber| {
@@ -194,7 +194,7 @@ fn memory_of_an_unread_publisher_is_unmapped_while_own_samples_are_read() {
         sample.copy_to(&mut out).unwrap();
         assert!(out == pattern(1, 5000), "what is in use stays");
     }
-    // And it comes back with the next.
+    // It is mapped again with the next subscriber.
     let mut late = together(&ours, &there, keep_last(1)).1.unwrap();
     take(&mut late);
 }
@@ -204,7 +204,7 @@ fn memory_that_could_not_be_mapped_is_mapped_when_there_is_room() {
     let (here, there) = contexts();
     let publisher = publisher(&here, keep_last(1));
     let mut subscriber = together(&publisher, &there, keep_last(1)).1.unwrap();
-    // All the address space that one context may take of another, but for a mebibyte.
+    // Takes all the address space that one context may take from another, except for a mebibyte.
     let open = |bytes| here.session().open_samples(publisher.gid(), bytes).unwrap().number();
     let mut numbers: Vec<_> = (0..63).map(|_| open(crate::limits::MAX_SEGMENT)).collect();
     numbers.push(open(crate::limits::MAX_SEGMENT - layout::SESSION_BYTES - (1 << 20)));
@@ -240,7 +240,7 @@ fn samples_whose_memory_never_came_are_lost_with_their_publishers_process() {
     assert_eq!((subscriber.received(), subscriber.lost()), (0, 3));
 }
 
-/// Sends what its receiver has no use for until the socket is full; how much that was.
+/// Sends packets that the receiver ignores until the socket is full. Returns their number.
 fn fill(socket: &impl AsFd) -> u32 {
     let mut sent = 0;
     while at_once(socket).withdraw(SessionId([7; 16]), 9).is_ok() {
@@ -251,13 +251,13 @@ fn fill(socket: &impl AsFd) -> u32 {
 
 #[test]
 fn a_peer_that_floods_packets_does_not_block_waits_or_takes() {
-    // One whose time is over takes one packet, however many there are.
+    // A call whose deadline has passed takes one packet, however many there are.
     let (ours, theirs) = pair();
     let sent = fill(&ours);
     let answer = at_once(&theirs).await_granted(Gid([1; 16]));
     assert!(matches!(answer, Err(ConnectError::Timeout)), "{answer:?}");
     assert!((1..sent).contains(&fill(&ours)));
-    // Nor does a take stay for all that there ever is.
+    // A take does not read all packets either.
     let (session, there) = (silent_session(), Context::new().unwrap());
     let writer = writer(&session, keep_last(5), 1 << 20);
     let (line, mut subscriber) = untold((&session, &writer), &there, None);
@@ -314,7 +314,8 @@ fn a_reader_with_our_session_id_is_served_only_if_we_ask() {
     let served = publisher.serve(ours, SOON);
     assert!(matches!(served, Err(ConnectError::Memory(ShmError::Refused { .. }))), "{served:?}");
     assert!(publisher.subscribers().is_empty());
-    // Those that do ask are served, and leave nothing behind.
+    // Subscribers of this context that really ask are served, and the failed ones left nothing
+    // behind.
     let mut subscriber = together(&publisher, &here, keep_last(1)).1.unwrap();
     publisher.publish(b"own").unwrap();
     assert_eq!(subscriber.recv(SOON).unwrap().unwrap().len(), 3);
@@ -334,7 +335,7 @@ fn a_publisher_cannot_withdraw_anothers_segments() {
     for number in 1..8 {
         at_once(&line).withdraw(here.id(), number).unwrap();
     }
-    // Memory of its own, as another's.
+    // A publisher announces its own memory as a segment of another context.
     let forged = SessionSegment::create(here.id()).unwrap();
     let segment = forged.open_samples(publisher.gid(), 2 * layout::ALIGN).unwrap();
     let (info, fd) = forged.segment(segment.number()).unwrap().unwrap();
@@ -354,9 +355,9 @@ fn a_forked_child_cuts_no_line_of_its_parents_and_takes_nothing_from_it() {
     let (here, there) = contexts();
     let publisher = publisher(&here, keep_last(1));
     let mut subscriber = together(&publisher, &there, keep_last(1)).1.unwrap();
-    // News of memory stands in the line when the process forks.
+    // An announcement is in the line when the process forks.
     publisher.publish(&pattern(1, 5000)).unwrap();
-    // SAFETY: the child makes no call but what follows, which takes no lock that another thread may
+    // SAFETY: the child only makes the following calls, which take no lock that another thread may
     // have held, and leaves by _exit.
     let child = unsafe { libc::fork() };
     if child == 0 {
@@ -371,7 +372,7 @@ fn a_forked_child_cuts_no_line_of_its_parents_and_takes_nothing_from_it() {
     assert_eq!(unsafe { libc::waitpid(child, &mut status, 0) }, child);
     assert_eq!(status, 0);
     assert_eq!(subscriber.recv(SOON).unwrap().expect("the news are there").len(), 5000);
-    // And so is the line: more memory comes over it.
+    // The line still works: it announces more memory.
     let _more = here.session().open_samples(publisher.gid(), 2 * layout::ALIGN).unwrap();
     publisher.reclaim_idle();
     subscriber.reclaim_idle();

@@ -16,7 +16,7 @@ use rustix::net::{
 use super::*;
 use crate::os::descriptors::PassedFd;
 
-/// Tells this binary that it is the other process, and which part it plays.
+/// Environment variable that makes this binary the other process, and names its part.
 pub(super) const PART: &str = "SHM_TEST_PART";
 /// The largest message that the tests send.
 pub(super) const LARGE: u64 = 25_000_000;
@@ -49,7 +49,7 @@ impl Wire {
         (bytes, fds)
     }
 
-    /// Hands one packet with its descriptors over to another.
+    /// Receives one packet with its descriptors, and sends it to another process.
     pub(super) fn pass_on(&self, to: &Self) {
         let (bytes, fds) = self.receive();
         to.send(&bytes, &fds.iter().map(AsFd::as_fd).collect::<Vec<_>>());
@@ -65,7 +65,7 @@ impl Wire {
         bytes.as_chunks::<8>().0.iter().map(|chunk| u64::from_le_bytes(*chunk)).collect()
     }
 
-    /// A session with all its segments.
+    /// Sends a session with all its segments, and a location and a GID in it.
     pub(super) fn send_session(&self, session: &SessionSegment, at: Location, gid: Gid) {
         let descriptors = session.descriptors().unwrap();
         let mut fds = vec![descriptors.segment, descriptors.doorbell, descriptors.pidfd];
@@ -80,7 +80,7 @@ impl Wire {
         self.send(&bytes, &fds.iter().map(AsFd::as_fd).collect::<Vec<_>>());
     }
 
-    /// The same, received: the session, what it names, and where.
+    /// Receives what [`send_session`](Self::send_session) sends.
     pub(super) fn receive_session(&self) -> (Arc<PeerSession>, Location, Gid) {
         let (bytes, fds) = self.receive();
         let (ids, bytes) = bytes.as_slice().split_at(32);
@@ -102,7 +102,7 @@ impl Wire {
         (peer, at, gid)
     }
 
-    /// The publisher's half of an attachment.
+    /// Runs the publisher's side of an attachment.
     pub(super) fn serve(&self, session: &SessionSegment, writer: &Writer, qos: Qos) {
         self.send_session(session, writer.location(), writer.gid());
         let (peer, lane, gid) = self.receive_session();
@@ -111,7 +111,7 @@ impl Wire {
         self.send_numbers(&[grant.generation, grant.first]);
     }
 
-    /// The reader's half.
+    /// Runs the reader's side of an attachment.
     pub(super) fn join(&self, session: &Arc<SessionSegment>, qos: Qos) -> Reader {
         let (peer, ring, writer) = self.receive_session();
         let lane = session.allocate_lane().unwrap();

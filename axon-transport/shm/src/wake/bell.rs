@@ -12,12 +12,12 @@ use rustix::{
 
 use crate::os::descriptors::PassedFd;
 
-/// How often, and after how long each time, a ring that the kernel has no memory for is tried again.
+/// Number of attempts to ring if the kernel has no memory for it, with a [`NAP`] after each.
 const TRIES: u32 = 100;
 const NAP: Duration = Duration::from_millis(1);
 
-/// One end of a pair of unix sockets. A process that holds it can ring, and nothing worse: it cannot take
-/// rings away, nor keep another from ringing but by closing the bell for all, which is noticed.
+/// The end of a pair of unix sockets that rings. A process that holds it can only ring: it cannot take rings away. It
+/// can keep another process from ringing only by closing the bell for all, which the receiver detects.
 pub(crate) struct DoorbellSender(PassedFd);
 
 impl DoorbellSender {
@@ -25,18 +25,17 @@ impl DoorbellSender {
         Self(fd)
     }
 
-    /// The end that another session handed over, if it is what it should be.
+    /// Wraps the end that another session passed, if it is a unix socket that preserves packets.
     pub(crate) fn received(fd: PassedFd) -> Option<Self> {
-        // Neither question reaches a file system, nor does ringing what answers so.
+        // Neither query reaches a file system, and neither does a send on a socket that passes both checks.
         let unix = sockopt::socket_domain(&fd) == Ok(AddressFamily::UNIX);
         let packets = sockopt::socket_type(&fd) == Ok(SocketType::SEQPACKET);
         (unix && packets).then_some(Self(fd))
     }
 
-    /// Rings, without waiting for the process at the other end; kernels before 6.9 may first look for
-    /// sockets that nobody can reach any more. That there is no room is as good: then rings stand
-    /// there that nobody has heard yet. `false` when the kernel had no memory for it for as long as a
-    /// publish may wait, and nobody was woken.
+    /// Rings, without waiting for the process at the other end. Kernels before 6.9 may first search for unreachable
+    /// sockets. A full queue counts as success: it holds rings that nobody has heard yet. Returns false if the kernel
+    /// had no memory during the time that a publish may wait; then nobody was woken.
     pub(crate) fn ring(&self) -> bool {
         for _ in 0..TRIES {
             match send(&self.0, &[1], SendFlags::DONTWAIT | SendFlags::NOSIGNAL) {

@@ -14,11 +14,11 @@ use super::{
     spin::Spin,
 };
 
-/// The longest sleep of a waiter where nobody watches the processes that are to ring: the waiter then
-/// finds news of a process that ended before it rang. Tests sleep for ever, so that they notice.
+/// The longest sleep of a waiter if nobody watches the processes that may ring. It then finds the news of a process
+/// that ended before it rang. In tests waiters sleep for ever, so that a lost ring is noticed.
 const MAX_SLEEP: Option<Duration> = if cfg!(test) { None } else { Some(Duration::from_secs(1)) };
 
-/// What a waiter waits for; each has its own armed word.
+/// The purpose of a wait; each has its own armed word.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Purpose {
     /// Samples to take, or any other news.
@@ -32,23 +32,23 @@ pub(crate) const PURPOSES: [Purpose; 2] = [Purpose::Samples, Purpose::Room];
 /// The armed words, in the order of [`PURPOSES`].
 pub(crate) type Words<'a> = [&'a AtomicU64; 2];
 
-/// A check that another thread may make for a waiter: whether its wait is over.
+/// A check that another thread may make for a waiter.
 pub trait WakeCheck: Send + Sync {
-    /// Whether the wait is over. Must be quick, and must not block on a thread that waits at a doorbell.
+    /// Returns whether the wait is over. Must be quick, and must not block on a thread that waits at a doorbell.
     fn ready(&self) -> bool;
 }
 
-/// A session of this process, at whose doorbell a thread may sleep.
+/// A session of this process at whose doorbell a thread may sleep.
 pub(crate) trait WakeListener: Send + Sync {
     /// Makes the listening thread check again.
     fn wake_listener(&self);
 }
 
-/// The threads of this process that sleep, and the one of them that listens for all.
+/// The sleeping threads of this process, and the thread that listens for all of them.
 ///
-/// One waiter leads: it listens to the bell, and when it rang, wakes the other waiters whose wait may be over.
-/// The others sleep until then. All tickets are given out under the lock, so the armed
-/// words only rise and a ringer never mistakes a new ticket for one it has rung for.
+/// One waiter leads: it listens to the bell, and when the bell rang, it wakes the other waiters whose wait may be over.
+/// The others sleep until then. All tickets are issued under the lock, so the armed words only increase, and a ringer
+/// never mistakes a new ticket for one that it has rung for.
 pub(crate) struct Doorbell {
     receiver: DoorbellReceiver,
     waiters: Mutex<Waiters>,
@@ -59,22 +59,22 @@ pub(crate) struct Doorbell {
 
 #[derive(Default)]
 struct Waiters {
-    /// Counts what may concern a waiter.
+    /// Counts the events that may concern a waiter.
     epoch: u64,
     ticket: u64,
     waiting: [u32; 2],
     leader: Leader,
-    /// What the external leader has armed.
+    /// The purposes that the external leader has armed.
     external: [bool; 2],
     followers: Vec<Arc<Follower>>,
-    /// Rings whose events have come stand in the queue. They are taken before the next ticket is
-    /// given out, which is before anybody can rely on an event of one that is taken with them.
+    /// True if the queue holds rings whose events have arrived. They are drained before the next ticket is issued, so
+    /// before any thread relies on the event of a ring that is drained with them.
     queued: bool,
-    /// Another process closed the bell for all.
+    /// True if another process closed the bell for all.
     closed: bool,
-    /// An event loop is about to lead.
+    /// True if an event loop is about to lead.
     coming: bool,
-    /// Somebody notifies when a process ends that might have rung.
+    /// True if another thread calls `notify` when a process ends that might have rung.
     watched: bool,
 }
 
@@ -90,7 +90,7 @@ enum Leader {
 struct Follower {
     turn: Condvar,
     look: Option<Arc<dyn WakeCheck>>,
-    /// It sleeps at the session's doorbell.
+    /// Set if the waiter sleeps at this session's doorbell instead.
     elsewhere: Option<Arc<dyn WakeListener>>,
 }
 
@@ -113,21 +113,22 @@ impl Doorbell {
         })
     }
 
-    /// The end that others ring.
+    /// Returns the end that other processes ring.
     pub(crate) fn bell(&self) -> &DoorbellSender {
         self.receiver.bell()
     }
 
-    /// Rings from this very process, whatever others do to the bell.
+    /// Rings from within this process. Works whatever other processes do to the bell.
     pub(crate) fn ring_own(&self) {
         self.receiver.wake_self();
     }
 
-    /// Waits until `ready`, asked again after each ring, each [`Doorbell::notify`] and each event
-    /// on `others`, or until `timeout` has passed. Returns what `ready` said last.
+    /// Waits until `ready` returns true or until `timeout` has passed. `ready` is called again after each ring, each
+    /// [`Doorbell::notify`] and each event on `others`. Returns the last result of `ready`.
     ///
-    /// A thread that follows does not see `others`. With `look`, which is made when it begins to follow
-    /// and must say what `ready` says, it is woken for nothing else but its turn to lead.
+    /// A thread that follows does not see `others`. `look` makes a check when the thread begins to follow; the check
+    /// must return what `ready` returns. With it, the thread is woken only if the check succeeds or if its turn to lead
+    /// has come.
     pub(crate) fn wait(
         &self,
         words: Words<'_>,
@@ -137,7 +138,7 @@ impl Doorbell {
         others: &[BorrowedFd<'_>],
         timeout: Option<Duration>,
     ) -> bool {
-        // What does not sleep in the end costs no look at the clock that can be done without.
+        // A wait that need not sleep should not read the clock.
         if ready() {
             return true;
         }
@@ -150,7 +151,7 @@ impl Doorbell {
             return true;
         }
         let start = Instant::now();
-        // Also when `ready` panics.
+        // Also dropped when `ready` panics.
         let _waiting = Waiting::new(self, words, purpose);
         loop {
             let armed_at = {
@@ -167,7 +168,7 @@ impl Doorbell {
                 return false;
             }
             self.sleep(words, armed_at, look, others, left);
-            // Most sleeps end with what they were for, which is not kept waiting for another ticket.
+            // Most sleeps end because `ready` holds. Then no other ticket is issued.
             if ready() {
                 self.spin.slept(start.elapsed());
                 return true;
@@ -175,13 +176,13 @@ impl Doorbell {
         }
     }
 
-    /// The caller [notifies](Self::notify) when a process ends that might have rung: from now on
-    /// waiters sleep for as long as nothing comes.
+    /// Declares that the caller [notifies](Self::notify) when a process ends that might have rung. From now on waiters
+    /// sleep without a limit.
     pub(crate) fn is_watched(&self) {
         self.lock().watched = true;
     }
 
-    /// Makes every waiter of this process look again.
+    /// Makes every waiter of this process call its `ready` again.
     pub(crate) fn notify(&self) {
         let mut waiters = self.lock();
         waiters.epoch += 1;
@@ -193,7 +194,7 @@ impl Doorbell {
         }
     }
 
-    /// Sleeps until something happened after epoch `armed_at`, or for `left`.
+    /// Sleeps until something happens after epoch `armed_at`, at most for `left`.
     fn sleep(
         &self,
         words: Words<'_>,
@@ -240,7 +241,7 @@ impl Doorbell {
         waiters.followers.retain(|other| !Arc::ptr_eq(other, &follower));
     }
 
-    /// Wakes those of the waiters that what was heard may concern.
+    /// Wakes the waiters that the events may concern.
     fn spread(&self, mut waiters: MutexGuard<'_, Waiters>, words: Words<'_>, heard: HeardBells) {
         if heard.closed && !waiters.closed {
             waiters.give_up(&self.receiver, "closed the session's doorbell");
@@ -256,7 +257,7 @@ impl Doorbell {
         }
         let followers = waiters.followers.clone();
         if followers.iter().any(|follower| follower.look.is_some()) {
-            // What comes after a look must ring again.
+            // News that comes after a check must ring again.
             waiters.arm(&self.receiver, &[words[Purpose::Samples as usize]]);
         }
         drop(waiters);
@@ -267,8 +268,8 @@ impl Doorbell {
         }
     }
 
-    /// Has the doorbell of `elsewhere`, where a thread of this process sleeps, rung when `look` may be
-    /// ready, until what this returns is dropped. Somebody must listen here meanwhile.
+    /// Rings the doorbell of `elsewhere`, where a thread of this process sleeps, when `look` may be ready, until the
+    /// returned value is dropped. Another thread must listen here meanwhile.
     pub(crate) fn forward_wakeups<'a>(
         &'a self,
         words: Words<'a>,
@@ -284,7 +285,7 @@ impl Doorbell {
         ForwardedWakeups { follower, waiting }
     }
 
-    /// An event loop leads from now on; `false` when another one does already.
+    /// Makes an event loop the leader. Returns false if another one leads already.
     pub(crate) fn lead_from_outside(&self) -> bool {
         let mut waiters = self.lock();
         if waiters.coming || waiters.leader == Leader::External {
@@ -292,7 +293,7 @@ impl Doorbell {
         }
         waiters.coming = true;
         while waiters.leader == Leader::Thread {
-            // It gives up the lead when it next wakes, which is now.
+            // The thread gives up the lead when it next wakes, which this causes.
             self.receiver.wake_self();
             waiters = self.way.wait(waiters).unwrap_or_else(PoisonError::into_inner);
         }
@@ -302,13 +303,13 @@ impl Doorbell {
         true
     }
 
-    /// The event loop takes what came.
+    /// Handles the events that arrived, for the event loop.
     pub(crate) fn take_from_outside(&self, words: Words<'_>) {
         let heard = self.receiver.take(Some(&Timespec::default()));
         self.spread(self.lock(), words, heard);
     }
 
-    /// The event loop is about to sleep.
+    /// Arms the words, because the event loop is about to sleep.
     pub(crate) fn arm_from_outside(&self, words: Words<'_>, purposes: &[Purpose]) {
         let mut waiters = self.lock();
         for &purpose in purposes {
@@ -317,14 +318,14 @@ impl Doorbell {
         }
     }
 
-    /// The event loop is not going to sleep.
+    /// Disarms the words, because the event loop does not sleep.
     pub(crate) fn disarm_from_outside(&self, words: Words<'_>) {
         let mut waiters = self.lock();
         waiters.external = [false; 2];
         PURPOSES.iter().for_each(|&purpose| waiters.disarm_idle(purpose, words));
     }
 
-    /// The event loop leads no more.
+    /// Ends the lead of the event loop.
     pub(crate) fn leave_from_outside(&self) {
         let mut waiters = self.lock();
         waiters.leader = Leader::None;
@@ -332,7 +333,7 @@ impl Doorbell {
         waiters.hand_over();
     }
 
-    /// As where the kernel cannot keep descriptors out of the bell.
+    /// Acts like a kernel that cannot keep descriptors out of the bell.
     #[cfg(test)]
     pub(crate) fn let_rights_pass(&mut self) {
         self.receiver.let_rights_pass();
@@ -344,13 +345,13 @@ impl Doorbell {
 }
 
 impl AsFd for Doorbell {
-    /// Readable when it rang.
+    /// Returns a descriptor that is readable after a ring.
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.receiver.as_fd()
     }
 }
 
-/// A follower that sleeps elsewhere, until it is dropped.
+/// Forwards wake-ups to a follower that sleeps at another doorbell, until it is dropped.
 pub struct ForwardedWakeups<'a> {
     follower: Arc<Follower>,
     waiting: Waiting<'a>,
@@ -363,7 +364,7 @@ impl Drop for ForwardedWakeups<'_> {
     }
 }
 
-/// One of the waiters, until it is dropped.
+/// The registration of a waiter, until it is dropped.
 struct Waiting<'a> {
     doorbell: &'a Doorbell,
     words: Words<'a>,
@@ -387,15 +388,15 @@ impl Drop for Waiting<'_> {
 }
 
 impl Waiters {
-    /// Gives out a new ticket.
+    /// Issues a new ticket.
     fn arm(&mut self, receiver: &DoorbellReceiver, words: &[&AtomicU64]) {
         if self.queued {
             let drained = receiver.drain();
             self.queued = drained == Drained::Some;
             match drained {
                 Drained::All => {}
-                // A ring whose event was still to come may have been taken with the others, and
-                // somebody sleeps who relies on it.
+                // A ring whose event is still to come may have been drained with the others, and a sleeping thread may
+                // rely on it.
                 Drained::Some => receiver.wake_self(),
                 Drained::Rights => {
                     self.give_up(receiver, "put descriptors into the session's doorbell")
@@ -406,7 +407,7 @@ impl Waiters {
         words.iter().for_each(|word| arm(*word, self.ticket));
     }
 
-    /// The bell is of no use any more: there is a look for news by time.
+    /// Gives up the bell, which has become useless. Waiters poll for news instead.
     fn give_up(&mut self, receiver: &DoorbellReceiver, what: &str) {
         self.closed = true;
         receiver.give_up();
@@ -416,11 +417,11 @@ impl Waiters {
         );
     }
 
-    /// Has who listens woken for nothing as often as is needed.
+    /// Sets the timer that wakes the listener without a ring.
     fn pace(&self, receiver: &DoorbellReceiver) {
         let interval = match self.leader {
             _ if self.closed => Some(CLOSED),
-            // Threads that listen see to it themselves.
+            // Threads limit their own sleeps.
             Leader::External => self.longest(),
             Leader::None | Leader::Thread => None,
         };
@@ -441,7 +442,7 @@ impl Waiters {
         }
     }
 
-    /// Has one of those that sleep listen, when nobody does.
+    /// Wakes a sleeping thread to lead, if no thread leads.
     fn hand_over(&self) {
         if self.leader == Leader::None
             && let Some(follower) = self.followers.iter().rfind(|one| one.elsewhere.is_none())

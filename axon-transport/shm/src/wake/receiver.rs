@@ -22,43 +22,43 @@ use rustix::{
 use super::DoorbellSender;
 use crate::os::descriptors::{PassedFd, carries_descriptors};
 
-/// Rings that one system call takes.
+/// Number of rings that one system call takes.
 const BATCH: usize = 8;
-/// How often there is a look once the bell has been closed.
+/// Polling interval after the bell has been closed.
 pub(super) const CLOSED: Duration = Duration::from_millis(5);
-/// Rings that are taken at a time.
+/// Maximum number of rings that one drain takes.
 const FLOOD: usize = 512;
 
 const BELL: u64 = 0;
 const OWN_WAKEUP: u64 = 1;
 const TICK: u64 = 2;
 
-/// A pair of sockets, of which one end rings, and what else wakes this process.
+/// The receiving end of the bell, with this process's other wake-ups.
 ///
-/// The ends are of packets and edge-triggered: each ring is an event, whether those before it have
-/// been taken or not. So who is woken need not take any, and is back in one system call.
+/// The sockets preserve packets and are watched edge-triggered: each ring is an event, whether or not the earlier rings
+/// have been taken. So a woken thread need not take any, and returns after one system call.
 pub(super) struct DoorbellReceiver {
     set: OwnedFd,
-    /// Where the kernel cannot keep descriptors out of it, it closes like one of another process.
+    /// If the kernel cannot keep descriptors out of it, it is closed like a descriptor of another process.
     heard: PassedFd,
-    /// Packets may carry descriptors.
+    /// True if packets may carry descriptors.
     rights: bool,
     bell: DoorbellSender,
-    /// Never handed out: an eventfd that this process wakes itself with.
+    /// An eventfd with which this process wakes itself. It is never passed to another process.
     own_wakeup: OwnedFd,
     tick: OwnedFd,
 }
 
-/// What came.
+/// The events that arrived.
 #[derive(Clone, Copy, Default)]
 pub(super) struct HeardBells {
     /// A ring of the bell, or a wake-up from this process.
     pub(super) rung: bool,
-    /// A ring of the bell, which stands in its queue.
+    /// A ring of the bell, which is still in its queue.
     pub(super) queued: bool,
-    /// The bell was closed, by another process.
+    /// Another process closed the bell.
     pub(super) closed: bool,
-    /// Only its time.
+    /// The timer fired.
     pub(super) tick: bool,
 }
 
@@ -81,14 +81,14 @@ impl DoorbellReceiver {
         Ok(Self { set, heard, rights, bell: DoorbellSender::new(given.into()), own_wakeup, tick })
     }
 
-    /// The end that rings.
+    /// Returns the end that rings.
     pub(super) fn bell(&self) -> &DoorbellSender {
         &self.bell
     }
 
     /// Wakes the thread that listens, from within this process.
     pub(super) fn wake_self(&self) {
-        // A counter that is full, after 2^64 of them, would be the only error.
+        // The only possible error is a full counter, after 2^64 wake-ups.
         let _ = write(&self.own_wakeup, &1u64.to_ne_bytes());
     }
 
@@ -99,7 +99,7 @@ impl DoorbellReceiver {
         let _ = timerfd_settime(&self.tick, TimerfdTimerFlags::empty(), &timer);
     }
 
-    /// Sleeps until something comes, for at most `left`. Events of `others` end it too.
+    /// Sleeps until an event arrives, at most for `left`. Events of `others` also end the sleep.
     pub(super) fn listen(&self, others: &[BorrowedFd<'_>], left: Option<Duration>) -> HeardBells {
         let whole = whole_millis(left);
         let timespec = |time| Timespec::try_from(time).ok();
@@ -112,13 +112,12 @@ impl DoorbellReceiver {
             .chain(others)
             .map(|fd| PollFd::from_borrowed_fd(*fd, PollFlags::IN))
             .collect();
-        // An interrupted poll counts as a spurious wake: the caller looks again and computes what
-        // remains of its time.
+        // An interrupted poll counts as a spurious wake-up: the caller checks again and computes the remaining time.
         let _ = poll(&mut fds, left.and_then(timespec).as_ref());
         self.take(Some(&Timespec::default()))
     }
 
-    /// What came, if it comes within `timeout`.
+    /// Returns the events that arrive within `timeout`.
     pub(super) fn take(&self, timeout: Option<&Timespec>) -> HeardBells {
         let mut heard = HeardBells::default();
         let mut events = [MaybeUninit::<epoll::Event>::uninit(); 4];
@@ -139,7 +138,7 @@ impl DoorbellReceiver {
         heard
     }
 
-    /// Listens to a bell that was closed no more.
+    /// Stops listening to a bell that was closed.
     pub(super) fn give_up(&self) {
         let _ = epoll::delete(&self.set, &self.heard);
     }
@@ -150,7 +149,7 @@ impl DoorbellReceiver {
         self.rights = true;
     }
 
-    /// Takes the rings that stand in the queue.
+    /// Takes the rings in the queue.
     pub(super) fn drain(&self) -> Drained {
         if self.rights {
             return self.drain_with_care();
@@ -164,8 +163,8 @@ impl DoorbellReceiver {
         Drained::Some
     }
 
-    /// Takes one ring at a time, and none with descriptors. These stay where they are: taken, they
-    /// would fill this process's table, and the kernel would close in this thread what did not fit.
+    /// Takes one ring at a time, and no packet with descriptors. Such a packet stays in the queue: its descriptors
+    /// would fill this process's table, and the kernel would close in this thread those that do not fit.
     fn drain_with_care(&self) -> Drained {
         for _ in 0..FLOOD {
             if carries_descriptors(&self.heard) {
@@ -180,43 +179,43 @@ impl DoorbellReceiver {
     }
 }
 
-/// What epoll may take of a wait. It counts in milliseconds and would be late by up to one, so the
-/// rest, for which the caller is back, is waited for in a way that takes longer to begin.
+/// Returns the part of a wait that epoll may do. epoll counts in milliseconds and would be late by up to one, so the
+/// remaining fraction is waited for by poll, which takes longer to start.
 pub(super) fn whole_millis(left: Option<Duration>) -> Option<Duration> {
     left.map(|left| left - Duration::from_nanos(u64::from(left.subsec_nanos()) % 1_000_000))
 }
 
-/// What became of the rings in a queue.
+/// The result of taking the rings of a queue.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(super) enum Drained {
-    /// None is left.
+    /// No ring is left.
     All,
-    /// There may be more: somebody rings without end.
+    /// Rings may be left: a process rings without end.
     Some,
-    /// One carries descriptors, as no ring does.
+    /// A packet carries descriptors, which no ring does.
     Rights,
 }
 
 impl AsFd for DoorbellReceiver {
-    /// Readable when there is something to take.
+    /// Returns a descriptor that is readable when an event is pending.
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.set.as_fd()
     }
 }
 
-/// Takes up to [`BATCH`] packets without looking at them. How many there were: fewer if no more stood
-/// there, or the call was interrupted.
+/// Takes up to [`BATCH`] packets without reading them. Returns their number: fewer if the queue had no more, or if the
+/// call was interrupted.
 fn receive_many(socket: BorrowedFd<'_>) -> usize {
     let mut byte = 0u8;
     let mut place = libc::iovec { iov_base: (&raw mut byte).cast(), iov_len: 1 };
-    // SAFETY: integers and pointers, all of which may be zero: no name, no control data.
+    // SAFETY: the structures contain integers and pointers, all of which may be zero: no name, no control data.
     let mut messages: [libc::mmsghdr; BATCH] = unsafe { MaybeUninit::zeroed().assume_init() };
     for message in &mut messages {
         message.msg_hdr.msg_iov = &raw mut place;
         message.msg_hdr.msg_iovlen = 1;
     }
-    // SAFETY: each of the `BATCH` headers has one place of one byte, which they may share as they
-    // are filled one after the other. `byte`, `place` and `messages` outlive the call.
+    // SAFETY: each of the `BATCH` headers has one buffer of one byte. They may share it, because the kernel fills them
+    // one after the other. `byte`, `place` and `messages` outlive the call.
     let received = unsafe {
         let (flags, no_timeout) = (libc::MSG_DONTWAIT, std::ptr::null_mut());
         libc::recvmmsg(socket.as_raw_fd(), messages.as_mut_ptr(), BATCH as u32, flags, no_timeout)
@@ -224,14 +223,13 @@ fn receive_many(socket: BorrowedFd<'_>) -> usize {
     usize::try_from(received).unwrap_or(0)
 }
 
-/// Whether packets may carry descriptors. Older kernels (Linux 6.16 is the first) let them; whether
-/// this one did as it was told.
+/// Sets whether packets may carry descriptors (Linux 6.16). Returns false on older kernels, where they always may.
 fn pass_rights(socket: BorrowedFd<'_>, may: bool) -> bool {
     const SO_PASSRIGHTS: libc::c_int = 83;
     let value = libc::c_int::from(may);
     let len = libc::socklen_t::try_from(size_of::<libc::c_int>()).expect("a few bytes");
-    // SAFETY: the option's value is an int; it is read during the call only. Older kernels say that
-    // they do not know the option.
+    // SAFETY: the option's value is an int, which is read only during the call. Older kernels return an error for the
+    // unknown option.
     unsafe {
         libc::setsockopt(
             socket.as_raw_fd(),

@@ -7,34 +7,34 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// About what a sleep and the ring that ends it cost both sides together on a virtual machine, where they
-/// cost most: with less, two who wait for each other never get to know that looking is worth it.
+/// About the cost of a sleep and of the ring that ends it, for both sides together, on a virtual machine, where it is
+/// highest. With less, two processes that wait for each other never find out that polling is worth it.
 const MAX_SPIN: Duration = Duration::from_micros(50);
 
-/// Looks between two looks at the clock, which takes longer than one.
+/// Number of polls between two readings of the clock. A reading takes longer than a poll.
 const MAX_SPINS: u32 = 8;
 
-/// Short sleeps, at most, that have to follow a look in vain before the next look.
+/// Most short sleeps that must follow an unsuccessful poll before the next poll.
 const MAX_SLEEPS_BEFORE_SPIN: u32 = 1023;
 
-/// Looks for as long as that has lately been worth its while: a sleep that turns out shorter than
-/// [`MAX_SPIN`] makes it look longer, one that does not half as long. A look in vain ends it, and the
-/// more of them follow each other, the more short sleeps it takes to look again: who is waited for
-/// may be on this very processor, and not run for as long as somebody looks out for it.
+/// Polls for as long as that has been worthwhile lately. A sleep that turns out shorter than [`MAX_SPIN`] makes the
+/// next poll longer, a longer sleep halves it. An unsuccessful poll stops polling. The more of them follow each other,
+/// the more short sleeps must come before the next poll: the awaited thread may be on this very processor, where it
+/// cannot run while this one polls.
 pub(super) struct Spin {
-    /// Nanoseconds to look for. Relaxed here as below: guesses, whose loss under a race costs
-    /// nothing.
+    /// Nanoseconds to poll. All accesses here are relaxed: the values are guesses, and a race that loses one does no
+    /// harm.
     now: AtomicU32,
-    /// Short sleeps still to come before the next look.
+    /// Number of short sleeps before the next poll.
     pause: AtomicU32,
-    /// Short sleeps that the next look in vain asks for.
+    /// Number of short sleeps that the next unsuccessful poll requires.
     patience: AtomicU32,
     most: u32,
 }
 
 impl Spin {
     pub(super) fn new() -> Self {
-        // On one processor who is looked out for cannot run meanwhile.
+        // On a single processor the awaited thread cannot run during a poll.
         let alone = available_parallelism().is_ok_and(|n| n.get() == 1);
         Self::up_to(if alone { Duration::ZERO } else { MAX_SPIN })
     }
@@ -45,7 +45,7 @@ impl Spin {
         Self { now, pause, patience, most }
     }
 
-    /// Whether `ready` came true, looked at again and again from `now` until `deadline` at the latest.
+    /// Polls `ready` from `now` on, at most until `deadline`. Returns whether it came true.
     pub(super) fn look(
         &self,
         mut ready: impl FnMut() -> bool,
@@ -75,7 +75,7 @@ impl Spin {
         false
     }
 
-    /// A sleep that was ended by what it waited for took this long.
+    /// Records the length of a sleep that ended because the awaited event came.
     pub(super) fn slept(&self, time: Duration) {
         let time = u32::try_from(time.as_nanos()).unwrap_or(u32::MAX);
         let pause = self.pause.load(Ordering::Relaxed);
@@ -93,7 +93,7 @@ impl Spin {
 mod tests {
     use super::*;
 
-    /// Both ends on one processor: nothing comes while one looks, and soon after one sleeps.
+    /// Both ends share a processor: no event comes during a poll, and one comes soon after a sleep begins.
     #[test]
     fn spinning_stops_where_the_peer_cannot_run_meanwhile() {
         let spin = Spin::up_to(Duration::from_micros(1));
@@ -112,8 +112,7 @@ mod tests {
             spin.slept(Duration::from_nanos(500));
         }
         assert!(vain <= 20, "{vain} looks");
-        // The other end moves to a processor of its own: the next look finds something, and so
-        // do all that follow.
+        // The other end moves to its own processor: the next poll succeeds, and so do all later ones.
         let mut found = 0;
         for _ in 0..10_000 {
             let one = spin.look(|| true, Instant::now(), None);

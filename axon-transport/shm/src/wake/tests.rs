@@ -28,10 +28,10 @@ use crate::{
     session::segment::SessionSegment,
 };
 
-/// Only a wake-up that was lost takes this long.
+/// Only a lost wake-up makes a wait take this long.
 const EVER: Duration = Duration::from_secs(60);
 
-/// Waits for `ready`, which must come true because the wait is woken.
+/// Waits until `ready` returns true; only a wake-up can make the wait end in time.
 fn await_woken(session: &SessionSegment, ready: impl FnMut() -> bool) {
     let start = Instant::now();
     assert!(session.wait(ready, Some(EVER)) && start.elapsed() < EVER, "a wake-up was lost");
@@ -72,7 +72,7 @@ fn the_last_check_or_the_doorbell_finds_every_sample() {
                 }
                 let mut rung = bell.0.lock().unwrap();
                 while !*rung {
-                    // The model fails here when nobody is left to ring.
+                    // The model fails here if no thread is left to ring.
                     rung = bell.1.wait(rung).unwrap();
                 }
                 *rung = false;
@@ -118,8 +118,8 @@ fn a_ring_that_another_thread_takes_is_not_slept_over() {
         while looks.load(Ordering::Acquire) < 2 {
             thread::yield_now();
         }
-        // The other thread leads. This one has armed and looked in vain when what it waits for
-        // comes, and the other takes the ring before this one gets to sleep.
+        // The other thread leads. This one has armed and found nothing when the event comes; the
+        // other takes the ring before this one sleeps.
         let mut mine = 0;
         await_woken(&session, || {
             mine += 1;
@@ -153,7 +153,7 @@ fn an_external_leader_and_blocked_threads_share_the_doorbell() {
     let (ping, pong) = (AtomicU64::new(0), AtomicU64::new(0));
     let over = AtomicBool::new(false);
     thread::scope(|scope| {
-        // Leads for a while as a thread, then follows.
+        // This thread leads for a while, then follows.
         scope.spawn(|| {
             for round in 1..=rounds {
                 await_woken(&session, || ping.load(Ordering::Acquire) == round);
@@ -190,7 +190,7 @@ fn an_external_leader_and_blocked_threads_share_the_doorbell() {
     assert!(Arc::clone(&session).external_leader().is_ok());
 }
 
-/// The end of a session's doorbell that others hold, as they may use it.
+/// Returns the end of a session's doorbell that other processes hold.
 fn handed_out(session: &SessionSegment) -> PassedFd {
     session.descriptors().unwrap().doorbell
 }
@@ -200,13 +200,13 @@ fn ringing_never_blocks() {
     let session = SessionSegment::create(SessionId::random()).unwrap();
     let fd = handed_out(&session);
     let flags = fcntl_getfl(&fd).unwrap();
-    // As of all that hold it.
+    // The flag is shared by all processes that hold the socket.
     fcntl_setfl(&fd, flags - OFlags::NONBLOCK).unwrap();
     let bell = DoorbellSender::received(fd).unwrap();
     for _ in 0..10_000 {
         bell.ring();
     }
-    // Nor does who listens, or notifies, while nobody takes the rings.
+    // A thread that listens or notifies does not block either while nobody takes the rings.
     session.notify();
     assert!(session.wait(|| true, None));
     let looks = AtomicU64::new(0);
@@ -225,7 +225,7 @@ fn a_full_queue_swallows_no_ring() {
                 while turn.load(Ordering::Acquire) != round {
                     thread::yield_now();
                 }
-                // Not a ring of them may be the one that is missing.
+                // A burst fills the queue. No single ring that follows may be lost.
                 let burst = if round % 100 == 1 { 1000 } else { 1 };
                 turn.store(round + 1, Ordering::Release);
                 (0..burst).for_each(|_| assert!(bell.ring()));
@@ -249,11 +249,11 @@ fn a_bell_that_was_closed_is_looked_after_by_time() {
             .map(|_| scope.spawn(|| await_woken(&session, || over.load(Ordering::Acquire))))
             .collect();
         shutdown(handed_out(&session), Shutdown::Both).unwrap();
-        // Nobody can ring.
+        // From now on no thread rings.
         over.store(true, Ordering::Release);
         waiters.into_iter().for_each(|waiter| waiter.join().unwrap());
     });
-    // An event loop is woken too.
+    // An event loop is woken as well.
     let leader = session.external_leader().unwrap();
     leader.clear();
     leader.arm(false);
@@ -264,7 +264,7 @@ fn a_bell_that_was_closed_is_looked_after_by_time() {
 #[test]
 fn descriptors_sent_to_a_doorbell_are_not_received_and_delay_no_wait() {
     let mut doorbell = Doorbell::new().unwrap();
-    // As where the kernel cannot refuse them.
+    // Acts like a kernel that cannot keep descriptors out of the bell.
     doorbell.let_rights_pass();
     let words = [AtomicU64::new(0), AtomicU64::new(0)];
     let words = words.each_ref();
@@ -283,11 +283,11 @@ fn descriptors_sent_to_a_doorbell_are_not_received_and_delay_no_wait() {
         looks == 8
     };
     assert!(doorbell.wait(words, Purpose::Samples, ready, None, &[], Some(EVER)));
-    // Nobody listens to the bell any more: it is looked for news by time.
+    // The session no longer listens to the bell and polls instead.
     let deaf = || start.elapsed() > Duration::from_millis(50);
     assert!(doorbell.wait(words, Purpose::Samples, deaf, None, &[], Some(EVER)));
     assert!(start.elapsed() < EVER, "a wake-up was lost");
-    // What was sent is nobody's but the queue's still, as its other end shows.
+    // The sent descriptor is still only in the queue, as its other end shows.
     let stands = recv(&kept, &mut [0; 1], RecvFlags::DONTWAIT);
     assert_eq!(stands.err(), Some(rustix::io::Errno::AGAIN));
 }
@@ -320,7 +320,7 @@ fn a_wait_is_as_long_as_it_was_told() {
     }
 }
 
-/// What a follower waits for, and how often it was asked for it.
+/// A follower's condition, and how often it was checked.
 #[derive(Default)]
 struct Flag {
     up: AtomicBool,
@@ -350,7 +350,7 @@ fn of_those_that_follow_the_right_one_is_woken() {
             })
             .collect();
         let armed = session.armed_word(Purpose::Samples);
-        // In another order than they came in; each time one leads that has nothing, or leaves.
+        // In another order than they arrived. Each time a thread leads that has nothing, or leaves.
         for index in [2, 0, 2, 0] {
             while armed.load(Ordering::Relaxed) == 0 {
                 thread::yield_now();

@@ -6,33 +6,34 @@
 
 use crate::sync::{Ordering, Site, Word, fence_at};
 
-/// Sleeper: arms `word` with `ticket`, larger than any before. Look for work after it.
+/// Sleeper: arms `word` with `ticket`, which is larger than any before. The sleeper checks for news after this.
 pub(crate) fn arm<W: Word>(word: &W, ticket: u64) {
     word.store(ticket, Ordering::Relaxed);
     // Pairs with the fence of `settle`.
     fence_at::<W>(Site::ArmFence);
 }
 
-/// Sleeper: nobody sleeps any more.
+/// Sleeper: disarms the word, because no thread sleeps any more.
 pub(crate) fn disarm<W: Word>(word: &W) {
     word.store(0, Ordering::Relaxed);
 }
 
-/// Waker: all that was stored so far comes before the look at any ticket that follows.
+/// Waker: orders all earlier stores before the following loads of tickets.
 #[inline]
 pub(crate) fn settle<W: Word>() {
     // Pairs with the fence of `arm`.
     fence_at::<W>(Site::SettleFence);
 }
 
-/// Waker, after [`settle`]: whether somebody is to be woken, now that there is something. `rung` is
-/// the last ticket that this process rang for; it is no concern of another process.
+/// Waker, after [`settle`]: returns whether a sleeper has to be woken for the news. `rung` is the last ticket that this
+/// process rang for; other processes do not use it.
 #[inline]
 pub(crate) fn waits<W: Word>(word: &W, rung: &W) -> bool {
     unrung(word, rung).is_some()
 }
 
-/// Waker, after [`settle`]: whether the doorbell must be rung, by the one who is told so.
+/// Waker, after [`settle`]: returns whether the caller has to ring the doorbell. Only one thread gets true for a
+/// ticket.
 #[inline]
 pub(crate) fn due<W: Word>(word: &W, rung: &W) -> bool {
     unrung(word, rung).is_some_and(|ticket| rung.fetch_max(ticket, Ordering::Relaxed) < ticket)

@@ -1,4 +1,4 @@
-//! Sessions that read many rings and look at few.
+//! Sessions that read many rings and look only at a few.
 
 use super::*;
 
@@ -20,7 +20,7 @@ impl Topic {
     }
 }
 
-/// Topics of which `from` reads all of `of`'s as a relay does, or otherwise.
+/// Creates topics of `of` that `from` reads, as a relay or for itself.
 fn topics(
     of: &Arc<SessionSegment>,
     from: &Arc<SessionSegment>,
@@ -30,7 +30,7 @@ fn topics(
     topics_with(of, from, numbers, relays, |_| {})
 }
 
-/// The same of publishers with which something is done before they are read.
+/// Like [`topics`]; calls `prepare` for each publisher before it gets a reader.
 fn topics_with(
     of: &Arc<SessionSegment>,
     from: &Arc<SessionSegment>,
@@ -72,7 +72,7 @@ fn active(session: &SessionSegment) -> Vec<(Gid, Gid)> {
     found
 }
 
-/// Readers that a look passes over besides those with news.
+/// Number of readers that a look includes in turn, besides the readers with samples.
 const IN_TURN: usize = 2;
 
 #[test]
@@ -88,7 +88,7 @@ fn a_sample_costs_a_look_at_its_reader_however_many_readers_there_are() {
             let found = active(&from);
             assert!(found.contains(&topic.pair()) && found.len() <= 1 + IN_TURN, "{found:?}");
         }
-        // A burst is one look at each.
+        // After a burst, each ring is looked at once.
         (51..=60).for_each(|sequence| topics[0].publish(sequence));
         assert!(active(&from).len() <= 1 + IN_TURN);
     }
@@ -156,7 +156,7 @@ fn sample_missing_in_the_journal_is_found_at_the_end_of_its_publisher() {
     from.follow();
     let topics = topics(&of, &from, 1..101, true);
     active(&from);
-    // Its process died after the sample was there, and before the entry was.
+    // The publisher died after it had stored the sample and before it noted the entry.
     topics[50].publish(1);
     of.journal().noted.store(0, Relaxed);
     assert!(!active(&from).contains(&topics[50].pair()), "nothing says so");
@@ -171,7 +171,7 @@ fn a_sample_whose_entry_was_counted_and_not_stored_is_found() {
     let topics = topics(&of, &from, 1..101, true);
     active(&from);
     topics[50].publish(1);
-    // Its process died in between.
+    // The publisher died between the count and the entry.
     of.journal().entries[0].store(0, Relaxed);
     assert!(active(&from).contains(&topics[50].pair()));
 }
@@ -189,7 +189,7 @@ fn a_late_relay_is_found_active_for_earlier_and_later_samples() {
     let (back, stands_for) = (peer(&of, &from), Some(vec![Gid([7; 16])]));
     let info = ReaderInfo { gid, lane: at, qos: late, peer: back, stands_for };
     let grant = writer.attach(info).unwrap();
-    // Between the grant and the map.
+    // The sample comes between the grant and the map.
     writer.publish(meta(2), b"between").unwrap();
     let options = ReaderOptions {
         reader: gid,
@@ -215,7 +215,7 @@ fn memory_that_came_has_its_sessions_readers_looked_at() {
     from.follow();
     let topics = topics(&of, &from, 1..20, true);
     active(&from);
-    // Another segment.
+    // The sample is in a new segment.
     topics[0].writer.publish(meta(1), &vec![7; 100_000]).unwrap();
     assert!(topics.iter().all(|topic| topic.reader.missing().is_none()));
     let found = active(&from);

@@ -1,4 +1,4 @@
-//! Rings that share a bound on their memory: what is beyond it follows their QoS.
+//! Rings that share a memory budget: if it is used up, each follows its QoS.
 
 use std::os::fd::AsFd;
 
@@ -10,10 +10,11 @@ use crate::{
 
 const IMAGE: usize = 300_000;
 const MOST: u64 = 8 << 20;
-/// What a ring has that counts for no budget: its first descriptors and header, of several rings.
+/// Memory of several rings that does not count in the budget: the headers and the first
+/// descriptors.
 const BESIDE: u64 = 1 << 20;
 
-/// A ring of 4 MiB whose number is that of its publisher.
+/// Creates a ring of 4 MiB, whose number is the number of its publisher.
 fn ring(session: &Arc<SessionSegment>, number: u32, qos: Qos, of: &Arc<MemoryBudget>) -> Writer {
     let gid = Gid::new(session.id(), number);
     let options = RingOptions { gid, qos, budget: 4 << 20, max_message: MAX, expected: 0 };
@@ -22,7 +23,7 @@ fn ring(session: &Arc<SessionSegment>, number: u32, qos: Qos, of: &Arc<MemoryBud
     writer
 }
 
-/// Bytes that are backed by memory, of all segments of a session.
+/// Returns the bytes that are backed by memory, of all segments of a session.
 fn backed(session: &SessionSegment) -> u64 {
     let numbers = session.segments().into_iter().map(|info| info.number).chain([0]);
     let segments = numbers.map(|number| session.segment(number).unwrap().unwrap().1);
@@ -33,7 +34,7 @@ fn try_publish(writer: &Writer, sequence: u64, len: usize) -> Result<(), Publish
     writer.try_publish(meta(sequence), &pattern(sequence, len)).map(drop)
 }
 
-/// Publishes samples of this length in each ring in turn.
+/// Publishes `count` samples of this length in each ring in turn.
 fn fill(writers: &[Writer], len: usize, count: u64) -> u64 {
     let mut refused = 0;
     for sequence in 0..count {
@@ -61,14 +62,14 @@ fn history_of_many_rings_is_bounded_together_and_given_back() {
         assert!(held <= MOST + BESIDE, "{held} of samples of {len}");
         assert!(budget.held() > MOST / 2, "most of it is of use: {}", budget.held());
         assert!(budget.refused() > 0);
-        // The newest sample is there for those that come later.
+        // Late joiners get the newest sample.
         let mut reader = attach(&writers[0], &a, &b, all);
         let mut last = None;
         while let Some(sequence) = take(&mut reader) {
             last = Some(sequence);
         }
         assert_eq!(last, Some(count - 1), "{len}");
-        // A publisher that ends keeps its part for as long as readers may be at it.
+        // The memory of a dropped publisher counts until no reader can read it.
         drop(writers.remove(0));
         let with_reader = budget.held();
         drop(reader);
@@ -86,7 +87,7 @@ fn a_ring_that_may_have_no_more_memory_shows_its_newest_sample() {
     let budget = MemoryBudget::new(MOST);
     let writers = [1, 2].map(|n| ring(&a, n, transient(keep_last(1)), &budget));
     publish(&writers[0], 0, IMAGE);
-    // Others take all but what the sample took.
+    // Other rings take everything except the sample's memory.
     let others: Vec<_> =
         (3..12).map(|n| ring(&a, n, transient(Qos::keep_all()), &budget)).collect();
     fill(&others, IMAGE, 20);

@@ -18,7 +18,7 @@ use crate::{
     tests::model::{Cell, check, record, zeros},
 };
 
-/// A ring with two arrays to be in: two descriptors, then four.
+/// A ring with two arrays: first two descriptors, then four.
 #[derive(Clone)]
 struct Growing {
     header: Arc<Vec<AtomicU64>>,
@@ -53,7 +53,7 @@ impl Growing {
     }
 }
 
-/// `ArrayStore`, `ArrayLoad`: what stands when the ring grows is found in either array.
+/// `ArrayStore`, `ArrayLoad`: kept samples are found in either array while the ring grows.
 #[test]
 fn samples_survive_the_growth_of_their_ring() {
     check(3, || {
@@ -72,7 +72,7 @@ fn samples_survive_the_growth_of_their_ring() {
                 RecordRead::Sample(found) => {
                     assert_eq!(found, record(position, PayloadLocation::Inline))
                 }
-                // It moved meanwhile.
+                // The ring moved meanwhile.
                 RecordRead::Lapped => {}
                 RecordRead::Corrupt(what) => panic!("{what}"),
             }
@@ -81,8 +81,8 @@ fn samples_survive_the_growth_of_their_ring() {
     });
 }
 
-/// `ReuseFence`, `StandsFence`: what another ring writes to the memory of the old array is not taken
-/// for a descriptor.
+/// `ReuseFence`, `StandsFence`: data that another ring writes to the memory of the old array is not mistaken for a
+/// descriptor.
 #[test]
 fn an_old_array_that_became_something_else_is_noticed() {
     check(3, || {
@@ -91,7 +91,7 @@ fn an_old_array_that_became_something_else_is_noticed() {
             let ring = ring.clone();
             thread::spawn(move || {
                 ring.grow(0, 2);
-                // By way of the heap: the memory is another ring's now, whose positions are its own.
+                // Through the heap, the memory now belongs to another ring, with positions of its own.
                 about_to_write::<AtomicU64>();
                 for word in &ring.arrays[0][..DESCRIPTOR_WORDS] {
                     Word::store(word, 2, Ordering::Relaxed);
@@ -110,7 +110,8 @@ fn an_old_array_that_became_something_else_is_noticed() {
     });
 }
 
-/// A reader that is late, and one that has taken all, find so in an array that is new to both.
+/// In an array that both see for the first time, a late reader finds that it is late, and a reader that has taken all
+/// finds that the next position is not published.
 #[test]
 fn a_new_array_shows_lapped_and_future_positions() {
     check(2, || {
@@ -127,7 +128,7 @@ fn a_new_array_shows_lapped_and_future_positions() {
     });
 }
 
-/// `MappedStore`, `MappedLoad`: what moves to a segment because it is mapped is found there.
+/// `MappedStore`, `MappedLoad`: the reader finds objects that moved to a segment because it was mapped.
 #[test]
 fn a_segment_that_is_said_to_be_mapped_is() {
     check(3, || {

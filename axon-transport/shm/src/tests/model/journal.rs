@@ -1,4 +1,4 @@
-//! A follower of a journal, which looks at no other rings than those that are named.
+//! A follower of a journal, which looks only at the rings that the journal names.
 
 use loom::{
     sync::{Arc, Condvar, Mutex, atomic::AtomicU64},
@@ -12,7 +12,7 @@ use crate::{
     wake::{arm, due, settle},
 };
 
-/// The shared words of a session with two rings, and its follower's.
+/// The words of a session with two rings, and those of its follower.
 #[derive(Clone)]
 struct Words {
     noted: Arc<AtomicU64>,
@@ -40,7 +40,7 @@ impl Words {
     }
 
     fn publish(&self, ring: u32) {
-        // Relaxed: only the journal says that it is there.
+        // Relaxed: only the journal orders the sample.
         Word::store(&self.rings[ring as usize], 1, Ordering::Relaxed);
         self.journal().note(ring);
         settle::<AtomicU64>();
@@ -50,10 +50,10 @@ impl Words {
         }
     }
 
-    /// Sleeps and looks until there is a sample in each ring.
+    /// Sleeps and checks until there is a sample in each ring.
     fn follow(&self) {
         let (mut place, mut found) = (JournalCursor::end(self.journal()), [false; 2]);
-        // As for a reader that has just come.
+        // All rings have to be checked first, as for a reader that was just attached.
         let mut all = true;
         let mut ticket = 0;
         loop {
@@ -73,7 +73,7 @@ impl Words {
             }
             let mut rung = self.bell.0.lock().unwrap();
             while !*rung {
-                // The model fails here when nobody is left to ring.
+                // The model fails here if no thread is left to ring.
                 rung = self.bell.1.wait(rung).unwrap();
             }
             *rung = false;
@@ -81,7 +81,8 @@ impl Words {
     }
 }
 
-/// `NotedAdd`, `NotedLoad`: who sees the count finds the sample, and who does not is woken.
+/// `NotedAdd`, `NotedLoad`: a follower that sees the count finds the sample; a follower that does
+/// not see it is woken.
 #[test]
 fn a_follower_finds_each_sample_in_the_rings_that_are_named() {
     check(3, || {
@@ -95,7 +96,7 @@ fn a_follower_finds_each_sample_in_the_rings_that_are_named() {
     });
 }
 
-/// An entry that another thread has counted and not stored yet names no ring, and hides none.
+/// An entry that another thread has counted but not stored names no ring, and hides none.
 #[test]
 fn a_follower_finds_entries_that_threads_note_concurrently() {
     check(2, || {

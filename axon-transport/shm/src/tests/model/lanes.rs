@@ -18,7 +18,7 @@ use crate::{
     tests::model::{Cell, Ring, check, granted, zeros},
 };
 
-/// `OpenStore`, `GenerationLoad`: what the lane's last reader left is not taken for this one's.
+/// `OpenStore`, `GenerationLoad`: the cursor of the lane's last reader is not mistaken for this reader's.
 #[test]
 fn a_lane_that_is_open_shows_the_cursor_of_its_reader() {
     check(3, || {
@@ -41,8 +41,8 @@ fn a_lane_that_is_open_shows_the_cursor_of_its_reader() {
     });
 }
 
-/// `CursorStore`, `CursorLoad`: what was given up is counted once the cursor has passed it, and only for
-/// the publisher of whose samples it was.
+/// `CursorStore`, `CursorLoad`: given-up samples are counted once the cursor has passed them, and only for their own
+/// publisher.
 #[test]
 fn given_up_samples_are_counted_before_the_cursor_passes() {
     check(3, || {
@@ -62,7 +62,7 @@ fn given_up_samples_are_counted_before_the_cursor_passes() {
         let cursor = tenancy.cursor(&lane[..]);
         let given_up = tenancy.given_up(&lane[..]);
         match cursor {
-            // The lane may have passed on since.
+            // The lane may belong to another reader by now.
             Some(5) => assert!([Some(2), None].contains(&given_up), "{given_up:?}"),
             _ => assert!([Some(0), Some(2), None].contains(&given_up), "{given_up:?}"),
         }
@@ -70,8 +70,7 @@ fn given_up_samples_are_counted_before_the_cursor_passes() {
     });
 }
 
-/// `CloseStore`, `AskStore`, `GenerationLoad`: a lane that is closed is not looked at for pins any
-/// more.
+/// `CloseStore`, `AskStore`, `GenerationLoad`: a publisher that sees a lane closed need not scan its pins.
 #[test]
 fn a_reader_that_has_left_has_read_all() {
     check(3, || {
@@ -87,7 +86,7 @@ fn a_reader_that_has_left_has_read_all() {
                     unpin(&lane[..], 0);
                 }
                 lane::close(&lane[..]);
-                // The next one that uses the lane, for another ring.
+                // The next reader uses the lane, for another ring.
                 lane::ask(&lane[..], 2);
             })
         };

@@ -11,7 +11,7 @@ use crate::{
     tests::model::{Cell, check},
 };
 
-/// `LetGoSwap`, `TakeSwap`.
+/// `LetGoSwap`, `TakeSwap`: a thread that takes the lock sees the writes of its last holder.
 #[test]
 fn a_new_holder_sees_the_last_holders_writes() {
     check(3, || {

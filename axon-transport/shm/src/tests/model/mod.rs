@@ -26,12 +26,12 @@ use crate::{
     session::lane::{self, LaneId},
 };
 
-/// Payload that is read and written like any memory.
+/// A payload that is read and written without atomics.
 struct Cell(loom::cell::UnsafeCell<u64>);
 
-// SAFETY: as below.
+// SAFETY: see `Sync` below.
 unsafe impl Send for Cell {}
-// SAFETY: the model checker itself finds any two accesses that are not ordered.
+// SAFETY: the model checker itself detects any two accesses that are not ordered.
 unsafe impl Sync for Cell {}
 
 impl Cell {
@@ -40,12 +40,12 @@ impl Cell {
     }
 
     fn get(&self) -> u64 {
-        // SAFETY: the checker fails the model if anything writes meanwhile.
+        // SAFETY: the checker fails the model if another thread writes meanwhile.
         self.0.with(|value| unsafe { *value })
     }
 
     fn set(&self, to: u64) {
-        // SAFETY: the checker fails the model if anything reads or writes meanwhile.
+        // SAFETY: the checker fails the model if another thread reads or writes meanwhile.
         self.0.with_mut(|value| unsafe { *value = to });
     }
 }
@@ -68,7 +68,7 @@ struct Ring {
 }
 
 impl Ring {
-    /// Of two descriptors.
+    /// Creates a ring with two descriptors.
     fn new() -> Self {
         Self { header: zeros(RING_WORDS), array: zeros(2 * DESCRIPTOR_WORDS) }
     }
@@ -81,7 +81,7 @@ impl Ring {
         &self.header[TAIL]
     }
 
-    /// Publishes a sample whose payload is elsewhere.
+    /// Publishes a sample whose payload is outside the descriptor.
     fn show(&self, position: u64) {
         self.publish(position, PayloadLocation::Inline);
     }
@@ -96,7 +96,7 @@ fn record(position: u64, place: PayloadLocation) -> Record {
     Record { sequence: 10 + position, timestamp: 0, published: 0, len: 0, place }
 }
 
-/// A lane that a reader has opened to take `first` next.
+/// Returns a lane that a reader has opened, with `first` as its next position.
 fn granted(first: u64) -> (Arc<Vec<AtomicU64>>, LaneId) {
     let lane = zeros(LANE_WORDS);
     lane::ask(&lane[..], 1);

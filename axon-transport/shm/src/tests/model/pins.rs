@@ -17,7 +17,7 @@ use crate::{
     tests::model::{Cell, Ring, check, granted},
 };
 
-/// Whether `position`, below the tail, may be written over.
+/// Returns whether `position`, which is below the tail, may be overwritten.
 fn is_free(lane: &[AtomicU64], tenancy: &LaneId, position: u64) -> bool {
     about_to_scan::<AtomicU64>();
     let mut found = Pinned::default();
@@ -25,7 +25,7 @@ fn is_free(lane: &[AtomicU64], tenancy: &LaneId, position: u64) -> bool {
     !found.keeps(position, 1)
 }
 
-/// Takes the next sample from `cursor` on in place, if there is one.
+/// Reads the next sample from `cursor` on in place, if there is one.
 fn take(ring: &Ring, lane: &[AtomicU64], cursor: &mut u64, read: impl Fn(u64)) {
     let (tail, head) = bounds(&ring.header).unwrap();
     *cursor = tail.max(*cursor);
@@ -36,7 +36,7 @@ fn take(ring: &Ring, lane: &[AtomicU64], cursor: &mut u64, read: impl Fn(u64)) {
     }
 }
 
-/// `ReclaimFence`, `PinFence`, `ScanLoad`, `UnpinStore`.
+/// `ReclaimFence`, `PinFence`, `ScanLoad`, `UnpinStore`: a pinned sample is not overwritten.
 #[test]
 fn a_sample_that_is_pinned_is_not_written_over() {
     check(3, || {
@@ -95,7 +95,7 @@ fn a_record_that_pins_another_sample_says_that_the_last_was_read() {
     });
 }
 
-/// `FreeLoad`: a sample is dropped by one thread while another takes the next.
+/// `FreeLoad`: one thread drops a sample while another takes the next.
 #[test]
 fn a_record_that_another_thread_freed_says_that_it_has_read() {
     check(3, || {
@@ -129,8 +129,7 @@ fn a_record_that_another_thread_freed_says_that_it_has_read() {
     });
 }
 
-/// `ReclaimFence`, `PinFence`: a publisher gives up what a reader has gone beyond, which that one may
-/// still keep.
+/// `ReclaimFence`, `PinFence`: a publisher gives up samples behind a reader's cursor, which the reader may still pin.
 #[test]
 fn a_sample_that_is_kept_beyond_the_cursor_is_not_written_over() {
     check(3, || {

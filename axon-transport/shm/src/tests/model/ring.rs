@@ -23,7 +23,7 @@ fn place(position: u64) -> PayloadLocation {
     PayloadLocation::Block(Location { segment: 0, offset: position % 2 * 16 })
 }
 
-/// Two words for every other sample.
+/// Returns the block of a position: two words, for every other sample.
 fn block(blocks: &[AtomicU64], position: u64) -> &[AtomicU64] {
     let start = (position % 2) as usize * 2;
     &blocks[start..start + 2]
@@ -35,7 +35,7 @@ fn write(ring: &Ring, blocks: &[AtomicU64], position: u64) {
     ring.publish(position, place(position));
 }
 
-/// What a reader that stands at `cursor` finds there: whether a whole sample.
+/// Reads the sample at `cursor`. Returns whether it was read whole.
 fn read(ring: &Ring, blocks: &[AtomicU64], cursor: u64) -> bool {
     match ring.view().look(cursor) {
         RecordRead::Lapped => false,
@@ -65,7 +65,7 @@ fn overtake(ring: &Ring, blocks: &[AtomicU64]) {
     }
 }
 
-/// `StampStore`, `StampLoad`, `ReuseFence`, `StandsFence`: a reader that looks at stamps alone.
+/// `StampStore`, `StampLoad`, `ReuseFence`, `StandsFence`: a reader that reads only stamps takes whole samples or none.
 #[test]
 fn a_reader_takes_whole_samples_or_none_while_it_is_overtaken() {
     check(3, || {
@@ -91,7 +91,7 @@ fn a_reader_takes_whole_samples_or_none_while_it_is_overtaken() {
     });
 }
 
-/// `HeadStore`, `HeadLoad`: what the head says to be there is.
+/// `HeadStore`, `HeadLoad`: all samples below the head are published.
 #[test]
 fn the_head_is_never_ahead_of_the_stamps() {
     check(3, || {
@@ -108,7 +108,7 @@ fn the_head_is_never_ahead_of_the_stamps() {
     });
 }
 
-/// `CursorStore`, `CursorLoad`.
+/// `CursorStore`, `CursorLoad`: a publisher that waits for the cursor overwrites no unread sample.
 #[test]
 fn a_publisher_that_waits_for_the_cursor_overwrites_nothing_unread() {
     check(3, || {
@@ -144,7 +144,7 @@ fn a_publisher_that_waits_for_the_cursor_overwrites_nothing_unread() {
     });
 }
 
-/// `TailStore`, `TailLoad`.
+/// `TailStore`, `TailLoad`: a reader never sees a tail above the head.
 #[test]
 fn a_reader_never_sees_a_tail_above_the_head() {
     check(3, || {
