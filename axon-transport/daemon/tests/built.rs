@@ -1,5 +1,5 @@
-//! A configuration that a program builds: what reaches its session and the daemon that it starts, whatever
-//! the environment says.
+//! A configuration that a program builds: it applies to the session and to the daemon that the session starts, and the
+//! environment does not change it.
 
 #[allow(dead_code, reason = "these tests start their daemons by sessions")]
 #[path = "support/mod.rs"]
@@ -13,7 +13,7 @@ use axon_transport::{
 };
 use support::{Host, say, wait_for_the_end};
 
-/// Variables that contradict what is built, are wrong, obsolete, foreign or misspelt.
+/// Variables that contradict the built configuration, or are wrong, obsolete, foreign or misspelt.
 const HOSTILE: &[(&str, &str)] = &[
     ("AXON_SECURITY_MODE", "qkd"),
     ("AXON_QUIC_CIPHER", "rot13"),
@@ -36,7 +36,7 @@ const HOSTILE: &[(&str, &str)] = &[
     ("XDG_RUNTIME_DIR", "/nowhere"),
 ];
 
-/// The program beside which an `axon.toml` lies that is not to be read.
+/// Returns a copy of the daemon, beside an `axon.toml` that must not be read.
 fn program(host: &Host) -> PathBuf {
     let program = host.dir.path().join("axon_daemon");
     if !program.exists() {
@@ -50,7 +50,7 @@ fn shown(config: &Config) -> String {
     format!("{config:?}")
 }
 
-/// What the children of the tests do. In a run of the tests themselves it does nothing.
+/// The code of the children of the tests. It does nothing in a run of the tests themselves.
 #[test]
 fn child() {
     let Ok(part) = std::env::var("PLAY") else { return };
@@ -83,7 +83,7 @@ fn status(json: &str) -> axon_transport::status::Status {
     serde_json::from_str(json).unwrap()
 }
 
-/// The end of a daemon that a test knows by its process alone.
+/// Waits for the end of a daemon that the test knows only by its pid.
 fn until_it_ends(pid: u32) {
     support::until("the daemon ends", || !fs::exists(format!("/proc/{pid}/exe")).unwrap());
 }
@@ -100,7 +100,7 @@ fn environment_variables_influence_neither_a_built_config_nor_its_daemon() {
     command.envs(HOSTILE.iter().copied());
     let mut player = host.play_in(command, "built");
 
-    // The very same as in a process without these variables: this one.
+    // The same as in a process without these variables, such as this one.
     assert_eq!(player.hear(), shown(&Config::default()));
     let built = player.hear();
     assert!(built.contains("domain: 5") && built.contains("Aes256Gcm"), "{built}");
@@ -112,14 +112,14 @@ fn environment_variables_influence_neither_a_built_config_nor_its_daemon() {
     let log = fs::read_to_string(run.join("axon-5.log")).unwrap();
     assert!(log.contains("DEBUG"), "its log is at the level that was built: {log}");
 
-    // A session with other settings meets that daemon, and is refused by it as ever.
+    // A session with other settings meets that daemon, which refuses it as usual.
     let other = Config::builder().domain(5).runtime_dir(&run).daemon(DaemonPolicy::Require);
     let other = Session::open(&other.build().unwrap(), SessionOptions::new("other")).unwrap_err();
     let SessionError::Mismatch { variable, .. } = &other else { panic!("{other}") };
     assert_eq!(variable, "AXON_QUIC_CIPHER");
 
     player.finish();
-    // By the grace time that was built.
+    // It ends after the grace time that was built.
     until_it_ends(status.pid);
 }
 

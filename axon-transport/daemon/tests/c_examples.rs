@@ -1,4 +1,4 @@
-//! The C programs of axon-transport's README, as processes of one host.
+//! Runs the C programs of axon-transport's README as processes of one host.
 
 #[path = "../../tests/support/c_program.rs"]
 mod c_program;
@@ -41,7 +41,7 @@ fn the_examples_are_built_by_plain_cc_and_meet() {
     let (talker, listener, service) = (build("talker"), build("listener"), build("service"));
     let daemon = Path::new(env!("CARGO_BIN_EXE_axon_daemon"));
     let _daemon = Kept(there(daemon).env_remove("AXON_DAEMON").spawn().unwrap());
-    // Once it has the address.
+    // Wait until the daemon has its address.
     while !directory.path().join("axon-0.sock").exists() {
         std::thread::sleep(Duration::from_millis(10));
     }

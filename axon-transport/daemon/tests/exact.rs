@@ -1,4 +1,5 @@
-//! The graph is exact: who is counted is reached, and who is gone is not counted.
+//! The graph is exact: an endpoint that is counted is reached, and an endpoint that is gone is not
+//! counted.
 
 mod support;
 
@@ -19,13 +20,13 @@ fn spec(topic: &str) -> EndpointSpec {
     EndpointSpec::new(topic, "T", Qos::default())
 }
 
-/// What the children of the tests do. In a run of the tests themselves it does nothing.
+/// The code of the children of the tests. It does nothing in a run of the tests themselves.
 #[test]
 fn child() {
     let Ok(part) = std::env::var("PLAY") else { return };
     let session = of_child(&part);
     match part.as_str() {
-        // Answers on /answer what comes on any of its topics.
+        // Publishes on /answer each sample that it takes on any of its topics.
         "echo" => {
             let answer = session.create_publisher(spec("/answer")).unwrap();
             assert!(answer.wait_matched(1, PATIENCE));
@@ -54,7 +55,7 @@ fn child() {
         "resting" => {
             let publisher = session.create_publisher(spec("/t")).unwrap();
             assert!(publisher.wait_matched(1, PATIENCE));
-            // What there was to do has been done.
+            // By then all pending work is done.
             std::thread::sleep(Duration::from_millis(500));
             let before = switches();
             std::thread::sleep(Duration::from_millis(1500));
@@ -65,7 +66,7 @@ fn child() {
     }
 }
 
-/// How often the threads of this process besides the calling one went to sleep.
+/// Returns how often the control threads of this process went to sleep.
 fn switches() -> u64 {
     let mut switches = 0;
     for task in std::fs::read_dir("/proc/self/task").unwrap() {
@@ -122,7 +123,7 @@ fn a_subscription_in_the_graph_gets_the_next_published_sample() {
     let mut bytes = Vec::new();
     for (round, publisher) in publishers.iter().enumerate() {
         let topic = &publisher.endpoint().topic;
-        // The guard condition alone tells that there is something to be seen.
+        // The guard condition alone reports that the graph changed.
         while session.graph().count(EndpointKind::Subscription, topic) == 0 {
             let graph = Waitable::GuardCondition(node.graph_changed());
             assert_eq!(session.wait_for(&[graph], Some(PATIENCE)).unwrap(), [0]);
@@ -163,7 +164,7 @@ fn within_a_session_pairs_come_and_go_without_the_daemon() {
         let EventStatus::Matched(status) = event.take() else { unreachable!() };
         (status.current, status.current_change, status.total_change)
     };
-    // Whatever it would have to say, it does not now.
+    // The daemon is stopped, so it sends nothing from here on.
     signal(daemon.0.id(), Signal::STOP);
     let subscription = session.create_subscription(spec("/t")).unwrap();
     let theirs = subscription.event(EventKind::SubscriptionMatched).unwrap();
@@ -174,7 +175,7 @@ fn within_a_session_pairs_come_and_go_without_the_daemon() {
     assert_eq!((matched(&ours), matched(&theirs)), ((1, 1, 1), (1, 1, 1)));
     publisher.publish(b"x").unwrap();
     assert!(subscription.take(&mut Vec::new()).is_some());
-    // What a publisher leaves is still taken.
+    // Samples of a dropped publisher can still be taken.
     let brief = session.create_publisher(spec("/t")).unwrap();
     brief.publish(b"y").unwrap();
     drop(brief);
@@ -195,7 +196,7 @@ fn within_a_session_pairs_come_and_go_without_the_daemon() {
     drop(server);
     assert!(!client.is_available());
 
-    // It finds them as they are, and nothing comes or goes again.
+    // The daemon finds the endpoints as they are, and reports no further changes.
     signal(daemon.0.id(), Signal::CONT);
     assert!(session.wait_graph(PATIENCE, |graph| graph.endpoints.len() == 3));
     until("nothing more is to be said", || {
@@ -205,7 +206,7 @@ fn within_a_session_pairs_come_and_go_without_the_daemon() {
     publisher.publish(b"z").unwrap();
     assert!(subscription.recv(&mut Vec::new(), Some(PATIENCE)).is_ok());
     assert_eq!((matched(&ours), matched(&theirs)), ((1, 0, 0), (1, 0, 0)));
-    // Who is gone is not counted either, whatever the daemon says.
+    // An endpoint that is gone is not counted either, whatever the daemon reports.
     signal(daemon.0.id(), Signal::STOP);
     drop(subscription);
     assert!(

@@ -1,4 +1,4 @@
-//! The examples of axon-transport do what they say.
+//! Checks that the examples of axon-transport do what they claim.
 
 #[path = "../../tests/support/built_examples.rs"]
 mod built_examples;
@@ -15,13 +15,13 @@ use support::{Host, Kept};
 
 const EXAMPLES: [&str; 6] = ["session", "service", "wait_set", "loan", "two_hosts", "tokio"];
 
-/// The program of an example.
+/// Returns the program of an example.
 fn example(name: &str) -> PathBuf {
     let package = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
     built_examples(package, &EXAMPLES, &EXAMPLES).join(name)
 }
 
-/// What a command prints that must succeed.
+/// Runs a command, which must succeed, and returns its output.
 fn run(command: &mut Command) -> String {
     let output = command.stderr(Stdio::inherit()).output().unwrap();
     let printed = String::from_utf8(output.stdout).unwrap();
@@ -31,7 +31,7 @@ fn run(command: &mut Command) -> String {
 
 #[test]
 fn examples_of_one_process_need_no_daemon() {
-    // Where no daemon could be started.
+    // On a host where no daemon can be started.
     let host = Host::new().with("AXON_DAEMON_PATH", "/dev/null");
     let printed = |name| run(&mut host.command(example(name)));
     assert_eq!(printed("service"), "17 bytes\n");
@@ -52,7 +52,7 @@ fn the_session_uses_the_daemon_of_its_user() {
 fn the_two_hosts_meet() {
     let pid = std::process::id();
     let address = |host: u32| format!("127.{}.{}.{host}", 230 + pid / 250 % 20, 1 + pid % 250);
-    // Below 100: other tests' daemons are above.
+    // Below 100: the daemons of other tests are above.
     let domain = (1 + pid % 98).to_string();
     let hosts = [1, 2].map(|host| {
         Host::new()

@@ -1,5 +1,4 @@
-//! A process that has nothing to do does nothing: processes at rest are not scheduled. What is asserted are counts
-//! of the kernel's, not times.
+//! An idle process does nothing: its threads are not scheduled. The tests assert counters of the kernel, not times.
 
 #[allow(dead_code, reason = "what other tests need of it")]
 mod support;
@@ -17,19 +16,19 @@ use axon_transport::{
 };
 use support::{Host, PATIENCE, say, until, wait_for_the_end};
 
-/// How long a process is watched. It used to wake up every second, several threads of it.
+/// How long a process is watched. Several threads of an earlier version woke up every second.
 const WATCH: Duration = Duration::from_secs(5);
-/// Between two looks whether a process has come to rest.
+/// Interval between two checks whether a process has come to rest.
 const SETTLE: Duration = Duration::from_millis(500);
 
-/// The lease of the endpoints that have one. It is renewed at each third of it.
+/// The lease of the endpoints that have one. It is renewed after each third of it.
 const LEASE: Duration = Duration::from_secs(3);
 
 fn spec(topic: &str) -> EndpointSpec {
     EndpointSpec::new(topic, "test/Bytes", Qos::default())
 }
 
-/// Not a test of its own: a process with some of everything, and a thread in each kind of wait.
+/// Not a test of its own: a process with endpoints of all kinds, and with a thread in each kind of wait.
 #[test]
 fn child() {
     let Ok(part) = std::env::var("PLAY") else { return };
@@ -49,7 +48,7 @@ fn child() {
         called.set_on_new_sample(Some(Arc::new(|_| {}))).unwrap();
     }
     assert!(talker.wait_matched(2, PATIENCE) && client.wait_available(PATIENCE));
-    // One sample for everybody: a thread that has slept and been woken sleeps again.
+    // One sample for each reader: a thread that was woken once sleeps again.
     talker.publish(b"once").unwrap();
     let all = [
         Waitable::GuardCondition(&never),
@@ -69,7 +68,7 @@ fn child() {
     });
 }
 
-/// How often each thread of a process has gone to sleep, by its number and name.
+/// Returns how often each thread of a process has gone to sleep, by thread id and name.
 fn sleeps(pid: u32) -> BTreeMap<String, u64> {
     let mut all = BTreeMap::new();
     for task in fs::read_dir(format!("/proc/{pid}/task")).unwrap() {
@@ -84,7 +83,7 @@ fn sleeps(pid: u32) -> BTreeMap<String, u64> {
     all
 }
 
-/// Once the threads of a process have come to rest, but those whose names `busy` knows.
+/// Waits until the threads of a process have come to rest, except those whose names `busy` accepts.
 fn settle(pid: u32, busy: impl Fn(&str) -> bool) {
     let resting = || -> BTreeMap<_, _> {
         sleeps(pid).into_iter().filter(|(thread, _)| !busy(thread)).collect()
@@ -97,7 +96,7 @@ fn settle(pid: u32, busy: impl Fn(&str) -> bool) {
     });
 }
 
-/// What has happened in a process since `before`, as counts of sleeps by thread.
+/// Returns how often each thread went to sleep since `before`.
 fn since(before: &BTreeMap<String, u64>, pid: u32) -> BTreeMap<String, u64> {
     let mut after = sleeps(pid);
     for (thread, count) in before {
@@ -107,7 +106,7 @@ fn since(before: &BTreeMap<String, u64>, pid: u32) -> BTreeMap<String, u64> {
     after
 }
 
-/// What a process at rest does within [`WATCH`].
+/// Returns how often the threads of an idle process wake up within [`WATCH`].
 fn wakes(pid: u32) -> BTreeMap<String, u64> {
     settle(pid, |_| false);
     let before = sleeps(pid);
@@ -126,7 +125,7 @@ fn a_process_at_rest_does_not_wake_up() {
     }
 }
 
-/// Each offers a lease, and watches its own and the other's.
+/// Each process offers a lease, and watches its own and the other's.
 #[test]
 fn leases_wake_only_the_control_thread_three_times_per_period() {
     let host = Host::new();
@@ -136,7 +135,7 @@ fn leases_wake_only_the_control_thread_three_times_per_period() {
     for player in &players {
         let control = |thread: &str| thread.ends_with(" axon-ctl");
         settle(player.pid(), control);
-        // However late this process is: what is counted was within the time that is.
+        // The counts are compared with the time that really passed, in case this process is late.
         let start = Instant::now();
         let before = sleeps(player.pid());
         let mut woken = BTreeMap::new();
@@ -166,8 +165,8 @@ fn a_relayed_process_at_rest_does_not_wake_up() {
 
 #[test]
 fn a_daemon_whose_sessions_rest_does_not_wake_up() {
-    // A domain and an address of its own: other daemons of this host link with it, and peers of one that
-    // ended still send to its port.
+    // A domain and an address of its own: other daemons of this host would connect, and peers of a daemon that ended
+    // may still send to its port.
     let [.., high, low] = std::process::id().to_be_bytes();
     let host = Host::new()
         .with("ROS_DOMAIN_ID", &(173 + low % 27).to_string())

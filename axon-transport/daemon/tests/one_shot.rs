@@ -1,4 +1,4 @@
-//! A publisher that counts a reader, publishes and ends at once.
+//! A publisher that counts a reader, publishes, and ends at once.
 
 mod support;
 
@@ -12,7 +12,7 @@ fn spec() -> EndpointSpec {
     EndpointSpec::new("/t", "test/Bytes", Qos::keep_all())
 }
 
-/// What the child of the tests does. In a run of the tests themselves it does nothing.
+/// The code of the child. It does nothing in a run of the tests themselves.
 #[test]
 fn child() {
     let Ok(part) = std::env::var("PLAY") else { return };
@@ -35,7 +35,7 @@ fn stop(pid: u32) {
     waitid(id, WaitIdOptions::STOPPED).unwrap();
 }
 
-/// A stopped publisher, and a reader that has asked it for its samples.
+/// A stopped publisher, and a reader that has requested its samples.
 struct Asked {
     _host: Host,
     _daemon: Kept,
@@ -53,7 +53,7 @@ impl Asked {
         stop(publisher.pid());
         let session = host.session("reader").unwrap();
         let subscription = session.create_subscription(spec()).unwrap();
-        // It waited for the stopped process for a second. What it asks for is on its way since then.
+        // The session has waited a second for the stopped process. Its request is on its way since then.
         until("the daemon shows the reader", || {
             let topics = host.status().unwrap().topics;
             topics.iter().any(|topic| topic.topic == "/t" && topic.subscriptions == 1)

@@ -1,4 +1,4 @@
-//! Services: requests, the responses that are each client's own, and which servers and clients see each other.
+//! Services: each client gets only its own responses; which servers and clients see each other.
 
 #[path = "support/alone.rs"]
 mod alone;
@@ -29,7 +29,7 @@ fn spec() -> EndpointSpec {
     EndpointSpec::new("/add", "Add", Qos::default())
 }
 
-/// Of what nobody took an endpoint of this keeps so much; without a depth all of it.
+/// Returns a spec whose endpoint keeps `depth` untaken messages, or all without a depth.
 fn keeping(depth: Option<u32>) -> EndpointSpec {
     let qos = match depth {
         Some(depth) => Qos::default().with_history(History::KeepLast).with_depth(depth),
@@ -38,7 +38,7 @@ fn keeping(depth: Option<u32>) -> EndpointSpec {
     spec().qos(qos)
 }
 
-/// Who asked, and under what number, of all that waits.
+/// Takes all waiting requests, and returns their clients and numbers.
 fn requests(server: &Server) -> Vec<(Gid, u64)> {
     let take = || server.take_request(&mut Vec::new());
     std::iter::from_fn(take).map(|info| (info.publisher, info.sequence)).collect()
@@ -65,12 +65,12 @@ fn call(client: &Client, bytes: &[u8]) -> Vec<u8> {
 }
 
 fn text(number: u64) -> Vec<u8> {
-    // Some of them are in memory that is pinned.
+    // Some messages are in pinned memory.
     let len = if number.is_multiple_of(7) { 10_000 } else { 20 };
     (0..len).map(|at| (at + number) as u8).collect()
 }
 
-/// What the children of the tests do. In a run of the tests themselves it does nothing.
+/// The code of the children of the tests. It does nothing in a run of the tests themselves.
 #[test]
 fn child() {
     let Ok(part) = std::env::var("PLAY") else { return };
@@ -88,7 +88,7 @@ fn child() {
             say("complete");
             wait_for_the_end();
         }
-        // Asks and never takes.
+        // Sends requests and never takes a response.
         "asker" => {
             let client = session.create_client(spec()).unwrap();
             assert!(client.wait_available(PATIENCE));
@@ -102,7 +102,7 @@ fn child() {
             let server = session.create_server(spec()).unwrap();
             say("serves");
             let mut bytes = Vec::new();
-            // Answers one and is in the middle of the next.
+            // Answers one request and is in the middle of the next.
             answer(&server);
             server.recv_request(&mut bytes, Some(PATIENCE)).unwrap();
             say("took");
@@ -355,7 +355,7 @@ fn a_late_callback_is_told_the_number_of_takeable_requests() {
     assert_eq!(told.recv_timeout(PATIENCE), Ok(4));
 }
 
-/// More than any ring has room for, to one that takes nothing meanwhile.
+/// Sends more than fits in any ring to an endpoint that takes nothing meanwhile.
 #[test]
 fn a_keep_last_service_never_blocks() {
     const MANY: u64 = 20_000;
@@ -376,7 +376,7 @@ fn a_keep_last_service_never_blocks() {
     assert_eq!(responses(&client), [MANY - 1, MANY]);
 }
 
-/// What is within the depth is not given up for want of room either.
+/// Messages within the depth are not dropped for lack of space either.
 #[test]
 fn a_depth_that_there_is_no_room_for_is_waited_for() {
     static LARGE: [u8; 300_000] = [7; 300_000];

@@ -1,4 +1,4 @@
-//! What a session does with its own endpoints, without a daemon.
+//! A session without a daemon, and its own endpoints.
 
 #[path = "support/alone.rs"]
 mod alone;
@@ -23,7 +23,7 @@ use axon_transport::{
 
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// The nodes that `session` sees, with the topics that each publishes.
+/// Returns the nodes that `session` sees, with the topics that each publishes.
 fn nodes(session: &Session) -> Vec<(String, Vec<String>)> {
     let graph = session.graph();
     let names = graph.nodes().into_iter().map(|node| {
@@ -60,7 +60,7 @@ fn an_endpoint_out_of_bounds_is_refused() {
     assert!(session.create_subscription(bottomless).is_err());
 }
 
-/// What two sessions would have in common, if anything.
+/// Everything that two sessions could have in common.
 #[test]
 fn sessions_of_a_process_without_a_daemon_know_nothing_of_each_other() {
     let sessions = [alone(), alone()];
@@ -82,7 +82,7 @@ fn sessions_of_a_process_without_a_daemon_know_nothing_of_each_other() {
         assert!(subscription.recv(&mut bytes, Some(PATIENCE)).is_ok());
         assert_eq!(bytes.iter().map(|byte| usize::from(*byte)).collect::<Vec<_>>(), [number]);
     }
-    // Were there more to come, it would have begun to long ago.
+    // If more endpoints were to appear, they would have by now.
     for (session, (_, subscription, publisher)) in sessions.iter().zip(&ends) {
         let moment = Duration::from_millis(100);
         assert!(!session.wait_graph(moment, |graph| graph.endpoints.len() > 4));
@@ -119,7 +119,7 @@ fn a_node_is_in_the_graph_from_its_creation_to_its_end() {
         let reached = session.wait_graph(PATIENCE, |_| nodes(&session) == expected);
         assert!(reached, "{:?} instead of {expected:?}", nodes(&session));
     };
-    // A query by name unites nodes of one name.
+    // A query by name merges nodes of the same name.
     expect(&[("idle", &[]), ("twin", &["/t"]), ("twin", &["/t"])]);
     let [first, second] = twins;
     drop(first);
@@ -282,7 +282,7 @@ fn no_signal_is_delivered_to_the_control_thread() {
     let before = blocked(here);
     let session = alone();
     assert_eq!(blocked(here), before, "the mask of the thread that opened it");
-    // Once it has told of something, its control thread has long had its name.
+    // When the session has reported an event, its control thread has its name.
     let (tells, told) = mpsc::channel();
     session.set_listener(move |event| tells.send(event.clone()).unwrap_or_default());
     let _publisher = session.create_publisher(spec(Qos::default())).unwrap();
@@ -290,7 +290,8 @@ fn no_signal_is_delivered_to_the_control_thread() {
     let named = |task: &Path| {
         std::fs::read_to_string(task.join("comm")).is_ok_and(|name| name.trim() == "axon-ctl")
     };
-    // Other tests' control threads begin and end meanwhile: one that ends has no mask any more.
+    // Control threads of other tests start and end meanwhile; a thread that ends has no mask any
+    // more.
     let deadline = Instant::now() + PATIENCE;
     loop {
         let tasks = std::fs::read_dir("/proc/self/task").unwrap().map(|task| task.unwrap().path());
@@ -309,7 +310,7 @@ fn every_call_of_a_forked_child_is_refused_without_waiting() {
     let publisher = session.create_publisher(spec(Qos::keep_all())).unwrap();
     let subscription = session.create_subscription(spec(Qos::keep_all())).unwrap();
     assert!(subscription.wait_matched(1, PATIENCE));
-    // One that stands there unread, and that the child must not be told of.
+    // An unread sample, of which the child must not be told.
     publisher.publish(b"x").unwrap();
     let service = || EndpointSpec::new("/s", "S", Qos::default());
     let server = session.create_server(service()).unwrap();
@@ -322,7 +323,7 @@ fn every_call_of_a_forked_child_is_refused_without_waiting() {
     let forked =
         |what: Result<(), SessionError>| what.is_err_and(|e| e.to_string().contains("fork"));
     thread::scope(|scope| {
-        // Whose locks the child finds taken, and nobody to give them back.
+        // The child finds the locks of these threads taken, and no thread releases them.
         for _ in 0..2 {
             scope.spawn(|| {
                 while !over.load(Ordering::Relaxed) {
@@ -338,10 +339,10 @@ fn every_call_of_a_forked_child_is_refused_without_waiting() {
             });
         }
         for _ in 0..40 {
-            // SAFETY: the child calls what must work in one, and leaves by _exit.
+            // SAFETY: the child makes calls that must work in a forked child, and leaves by _exit.
             let child = unsafe { libc::fork() };
             if child == 0 {
-                // SAFETY: has it killed if it hangs.
+                // SAFETY: the alarm kills the child if it hangs.
                 unsafe { libc::alarm(30) };
                 let mut bytes = Vec::new();
                 let refused = [
@@ -399,7 +400,7 @@ fn every_call_of_a_forked_child_is_refused_without_waiting() {
     assert!(matched.is_ready() && !guard.is_triggered());
 }
 
-/// Threads that share everything and ask nobody.
+/// Threads that use everything concurrently without coordination.
 #[test]
 fn threads_create_use_and_end_endpoints_concurrently() {
     let session = alone();
@@ -468,13 +469,13 @@ fn threads_create_use_and_end_endpoints_concurrently() {
                         }
                     }
                 }
-                // The session's handles go before its endpoints.
+                // The session's handles are dropped before its endpoints.
                 drop(session);
             });
         }
     });
     assert!(session.wait_graph(PATIENCE, |graph| graph.endpoints.is_empty()));
-    // Nothing stays matched with what is gone.
+    // Nothing stays matched with an endpoint that is gone.
     let publisher =
         session.create_publisher(EndpointSpec::new("/t0", "T", Qos::default())).unwrap();
     assert!(publisher.matched().is_empty());

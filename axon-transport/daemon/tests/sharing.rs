@@ -1,4 +1,4 @@
-//! A process of the same user that keeps the daemon's control plane busy: the others are served beside it.
+//! A process of the same user keeps the daemon's control plane busy; other processes are served meanwhile.
 
 #[allow(dead_code, reason = "what other tests need of it")]
 mod support;
@@ -22,31 +22,31 @@ use axon_transport::{
 use rustix::process::Signal;
 use support::{Host, Player, of_child, say, signal};
 
-/// Publishers, and as many subscriptions, of one topic.
+/// Number of publishers, and of subscriptions, of one topic.
 const MANY: usize = 1000;
-/// What the honest process does, so often; `ROUNDS=5000` for longer.
+/// Number of rounds of the honest process; `ROUNDS=5000` for longer.
 const ROUNDS: usize = 200;
-/// So many of the rounds before the daemon has taken what the crowd asks for.
+/// Minimum number of rounds before the daemon has handled the crowd's endpoints.
 const BEFORE: usize = 20;
-/// How long it may take until the crowd's pairs have met: the honest process goes first all the while. Until the first has
-/// it is seconds on an idle machine, and was almost a minute on a loaded one.
+/// Time limit until the crowd's pairs are matched, while the honest process has priority. The first match takes seconds
+/// on an idle machine, and took almost a minute on a loaded one.
 const MEETING: Duration = Duration::from_secs(600);
-/// So many of its pairs meet at least: of a million those for which the session has lanes.
+/// Number of the crowd's pairs that must match: of a million, those for which the session has lanes.
 const PAIRS: usize = 100_000;
-/// So many of them meet at most while others have one round.
+/// Maximum number of the crowd's pairs that match during one round of other processes.
 const MOST_PAIRS_A_ROUND: usize = 5_000;
-/// Connections that say nothing.
+/// Number of silent connections.
 const SILENT: usize = 800;
-/// More than a daemon keeps that say nothing.
+/// More silent connections than a daemon keeps.
 const MORE: usize = 300;
-/// A connection that says nothing for this long is closed in any case, or soon.
+/// The daemon closes a silent connection after this time at the latest, or soon after.
 const SOON: Duration = Duration::from_secs(4);
 
 fn spec(topic: &str) -> EndpointSpec {
     EndpointSpec::new(topic, "test/Bytes", Qos::default().with_depth(1))
 }
 
-/// Not a test of its own: what the other processes do.
+/// The code of the other processes; not a test of its own.
 #[test]
 fn child() {
     let Ok(part) = std::env::var("PLAY") else { return };
@@ -61,7 +61,7 @@ fn child() {
     let subscriptions: Vec<_> =
         (0..MANY).map(|_| session.create_subscription(spec("/crowd")).unwrap()).collect();
     say("made");
-    // Asked, how many of the pairs have met. It is as many in the end as the session has lanes.
+    // On request, reports how many of the pairs have matched. In the end there are as many as the session has lanes.
     for line in std::io::stdin().lines() {
         line.unwrap();
         say(publishers.iter().map(|one| one.matched().len()).sum::<usize>());
@@ -69,14 +69,14 @@ fn child() {
     drop((publishers, subscriptions));
 }
 
-/// Keeps so many connections that say nothing. One that the daemon closed, or does not take, is made anew.
-/// Asked to go on, it makes [`MORE`] and says how many were closed so far.
+/// Keeps [`SILENT`] silent connections. Replaces a connection that the daemon closed or refused. On request, opens
+/// [`MORE`] and reports how many were closed so far.
 fn say_nothing() {
     let address = Address::of(&axon_transport::config::Config::from_env().unwrap());
     let asked = Arc::new(AtomicUsize::new(0));
     let hears = Arc::clone(&asked);
     let end = thread::spawn(move || {
-        // Relaxed: nothing else is told by it.
+        // Relaxed: the counter orders nothing else.
         let lines = std::io::stdin().lines().map_while(Result::ok);
         lines.for_each(|_| _ = hears.fetch_add(1, Ordering::Relaxed));
     });
@@ -103,12 +103,12 @@ fn say_nothing() {
     }
 }
 
-/// Whether the daemon closed a connection.
+/// Returns whether the daemon closed a connection.
 fn is_closed(connection: &impl std::os::fd::AsFd) -> bool {
     matches!(socket::receive(connection, &mut Vec::new()), Err(socket::SocketError::Closed))
 }
 
-/// The longest that anything took.
+/// The longest duration of each operation.
 #[derive(Debug, Default)]
 struct Longest {
     status: Duration,
@@ -117,7 +117,7 @@ struct Longest {
 }
 
 impl Longest {
-    /// Does what an honest process does, once.
+    /// Does once what an honest process does.
     fn round(&mut self, host: &Host) {
         let begin = Instant::now();
         host.status().expect("the status");
@@ -139,7 +139,7 @@ fn rounds() -> usize {
     std::env::var("ROUNDS").map_or(ROUNDS, |rounds| rounds.parse().unwrap())
 }
 
-/// An honest process is served while a player ends, too.
+/// Checks that an honest process is also served while a player ends.
 fn is_served_while_it_ends(host: &Host, player: Player) {
     let mut after = Longest::default();
     thread::scope(|scope| {
@@ -162,7 +162,7 @@ fn a_million_pairs_of_one_process_hold_up_no_other() {
     alone(&host);
     let mut crowd = host.play("crowd");
     assert_eq!(crowd.hear(), "begins");
-    // All that it asks for is there at once.
+    // All of its requests are there at once.
     signal(daemon.0.id(), Signal::STOP);
     crowd.go();
     assert_eq!(crowd.hear(), "made");
@@ -180,7 +180,7 @@ fn a_million_pairs_of_one_process_hold_up_no_other() {
     let before = before.unwrap_or_else(rounds);
     eprintln!("{before} rounds before the crowd was taken; beside it {beside:?}");
     assert!(before >= BEFORE, "{before} rounds before the crowd was taken");
-    // Then its pairs meet. What the daemon does for them is counted in pairs, what it does for others in rounds.
+    // Then its pairs match. The test counts the daemon's work for them in pairs, and its work for others in rounds.
     let mut met = || {
         crowd.go();
         crowd.hear().parse::<usize>().unwrap()
@@ -210,7 +210,7 @@ fn connections_that_say_nothing_hold_up_no_process() {
     let mut beside = Longest::default();
     let (mut kept, mut closed) = (0, 0);
     for _ in 0..rounds() / 10 {
-        // This process says nothing for a while, either.
+        // This process is silent for a while, too.
         let (begin, honest) = (Instant::now(), address.connect().unwrap());
         silent.go();
         (0..10).for_each(|_| beside.round(&host));

@@ -1,5 +1,5 @@
-//! What the daemon says of topics: who publishes and reads, what memory it takes, what was dropped
-//! and why, and who does not take what is there.
+//! The daemon's status of topics: publishers and readers, memory, dropped samples and their causes,
+//! and readers that lag.
 
 #[allow(dead_code, reason = "what other tests need of it")]
 mod support;
@@ -23,7 +23,7 @@ fn best_effort(depth: u32) -> Qos {
     Qos::default().with_reliability(Reliability::BestEffort).with_depth(depth)
 }
 
-/// Not a test of its own: what the other processes do.
+/// The code of the other processes; not a test of its own.
 #[test]
 fn child() {
     let Ok(part) = std::env::var("PLAY") else { return };
@@ -74,7 +74,7 @@ fn status_names_a_stopped_reader_with_its_backlog_and_no_active_reader() {
     assert_eq!((reader_of(&seen, still).unread, reader_of(&seen, still).depth), (1, Some(5)));
     assert_eq!(seen.dropped.values().sum::<u64>(), 0);
 
-    // More than any window holds: what it could have taken is written over.
+    // More samples than any window holds: samples that it could have taken are overwritten.
     for _ in 0..100 {
         publisher.publish(&[0; 8]).unwrap();
     }

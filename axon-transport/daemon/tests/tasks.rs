@@ -1,4 +1,4 @@
-//! Tasks that wait for what other processes send.
+//! Tasks that wait for messages of other processes.
 
 #[allow(dead_code, reason = "not every test needs all of it")]
 mod support;
@@ -28,7 +28,7 @@ fn child() {
     let Ok(part) = std::env::var("PLAY") else { return };
     let session = of_child(&part);
     match part.as_str() {
-        // Answers each request with itself, and repeats each sample.
+        // Answers each request with its own content, and republishes each sample.
         "echo" => {
             let server = session.create_server(spec("/s")).unwrap();
             let subscription = session.create_subscription(spec("/there")).unwrap();
@@ -65,7 +65,7 @@ fn child() {
     }
 }
 
-/// In lockstep with a process whose tasks sleep, so that each sample has to wake one on either side.
+/// Runs in lockstep with a process whose tasks sleep, so that each sample has to wake one on either side.
 fn go_to_and_fro(here: &Host, there: &Host) {
     let _daemon = here.daemon();
     let mut other = there.play("echo");
@@ -80,7 +80,7 @@ fn go_to_and_fro(here: &Host, there: &Host) {
         scope.spawn(|| {
             runtime().block_on(async {
                 for round in 0..ROUNDS {
-                    // Some of them in place.
+                    // Some of them are taken in place.
                     let bytes = round.to_le_bytes().repeat(if round % 8 == 0 { 5000 } else { 1 });
                     publisher.publish(&bytes).unwrap();
                     let back = tokio::time::timeout(PATIENCE, subscription.recv_async()).await;

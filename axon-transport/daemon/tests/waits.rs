@@ -1,4 +1,4 @@
-//! Waiting for several things at once, and being told of samples.
+//! Waits for several things at once, and callbacks for samples.
 
 #[path = "support/alone.rs"]
 mod alone;
@@ -95,7 +95,7 @@ fn wait_includes_items_of_other_sessions() {
         thread::scope(|scope| {
             let waiter = scope.spawn(|| session.wait_for(&all, None).unwrap());
             if round % 2 == 0 {
-                // Sometimes it sleeps by now.
+                // In some rounds the waiter sleeps by now.
                 thread::sleep(Duration::from_micros(round * 3));
             }
             match round % 3 {
@@ -174,7 +174,7 @@ fn many_threads_wait_each_for_its_own() {
                             } else {
                                 guard.trigger();
                             }
-                            // One at a time: the other side says that it has had it.
+                            // One at a time: the other side shows that it has handled it.
                             while guard.is_triggered() || subscription.has_data() {
                                 thread::yield_now();
                             }
@@ -207,13 +207,13 @@ extern "C" fn handle(_: libc::c_int) {
 fn a_signal_handler_may_trigger() {
     let session = alone();
     let guard = HANDLED.get_or_init(|| session.create_guard_condition()).clone();
-    // SAFETY: the handler does nothing that is not async-signal-safe.
+    // SAFETY: the handler does only what is async-signal-safe.
     unsafe { libc::signal(libc::SIGUSR2, handle as *const () as libc::sighandler_t) };
     let all = [Waitable::GuardCondition(&guard)];
     let over = AtomicBool::new(false);
     let pid = i32::try_from(std::process::id()).unwrap();
     thread::scope(|scope| {
-        // Signals arrive in any thread, in the middle of anything.
+        // Signals arrive in any thread, at any point.
         scope.spawn(|| {
             while !over.load(Ordering::SeqCst) {
                 // SAFETY: sends this process a signal that it handles.
@@ -259,7 +259,7 @@ fn new_samples_are_told_of_each_once_and_those_that_wait_at_once() {
         }
     }
     wait(202);
-    // Threads that wait are woken all the same.
+    // Waiting threads are still woken.
     while subscription.take(&mut Vec::new()).is_some() {}
     thread::scope(|scope| {
         let all = [Waitable::Subscription(&subscription)];
@@ -298,7 +298,7 @@ fn a_replacement_callback_is_not_told_already_reported_samples() {
     (0..3).for_each(|_| publish());
     set("third");
     assert_eq!(told.recv_timeout(PATIENCE), Ok(("third", 3)));
-    // None that is taken already, though nobody was told of it.
+    // A sample that was taken already is not reported, although no callback was told of it.
     subscription.set_on_new_sample(None).unwrap();
     publish();
     while subscription.take(&mut Vec::new()).is_some() {}
@@ -307,7 +307,7 @@ fn a_replacement_callback_is_not_told_already_reported_samples() {
     assert_eq!(told.recv_timeout(PATIENCE), Ok(("fourth", 1)));
 }
 
-/// Whichever thread comes last: a callback that stays set is told of what comes.
+/// Whichever thread comes last: a callback that stays set is told of later samples.
 #[test]
 fn a_callback_that_is_set_while_another_thread_unsets_it_is_told_or_gone() {
     let session = alone();
@@ -345,7 +345,7 @@ fn an_event_loop_and_callbacks_do_not_listen_at_once() {
     assert!(session.segment().external_leader().is_err());
     drop(subscription);
     let deadline = std::time::Instant::now() + PATIENCE;
-    // The control thread lets go of it when it next looks.
+    // The control thread releases the lead when it next checks.
     while session.segment().external_leader().is_err() {
         assert!(std::time::Instant::now() < deadline);
         thread::yield_now();

@@ -1,4 +1,4 @@
-//! Where sessions and their daemon meet, whatever another user has done to the address.
+//! The address at which sessions and their daemon meet, also if another user has interfered with it.
 
 use std::os::{fd::OwnedFd, unix::fs::PermissionsExt as _};
 
@@ -15,12 +15,12 @@ use super::{
     *,
 };
 
-/// A host whose sessions have an abstract name, in a domain that no other test has.
+/// A host without a runtime directory: its sessions use an abstract name, in a domain that no other test uses.
 fn host(domain: &str) -> Host {
     Host::new().without("AXON_RUNTIME_DIR").with("ROS_DOMAIN_ID", domain)
 }
 
-/// The same, with a runtime directory of the user's login.
+/// Adds the runtime directory of a login to the host.
 fn with_login(host: Host) -> Host {
     let login = host.dir.path().join("login");
     std::fs::create_dir_all(&login).unwrap();
@@ -28,7 +28,7 @@ fn with_login(host: Host) -> Host {
     host.with("XDG_RUNTIME_DIR", login.to_str().unwrap())
 }
 
-/// Binds the abstract name of a host's daemon, and does not listen there.
+/// Binds the abstract name of a host's daemon, but does not listen there.
 fn squat(host: &Host) -> OwnedFd {
     bind_name(&Address::of(&host.config()).to_string())
 }
@@ -47,7 +47,7 @@ fn bound_abstract_name_without_a_runtime_directory_is_reported() {
     let _squatter = squat(&host);
     let said = host.play("idle").hear();
     assert!(said.contains("XDG_RUNTIME_DIR") && said.contains("serves no session"), "{said}");
-    // Half a second apart: a session that has patience with the squatter starts one after the other for 20 s.
+    // Attempts are half a second apart. A session that kept trying would start one daemon after another for 20 s.
     assert_eq!(started(&host), 5, "a daemon finds the name taken");
 }
 
@@ -58,9 +58,9 @@ fn abstract_name_of_another_user_is_an_error_with_the_owner() {
         return skip::skip("only root can be two users");
     }
     let host = host("188");
-    // Of this user: an address names whose it is.
+    // The address contains the id of this user.
     let address = Address::of(&host.config()).to_string();
-    // The kernel notes the user of the thread that listens.
+    // The kernel records the user of the thread that listens.
     let listener = std::thread::scope(|scope| {
         let other_user = scope.spawn(|| {
             set_thread_uid(Uid::from_raw(NOBODY)).unwrap();

@@ -1,16 +1,17 @@
-//! Variables that begin with `AXON_` and belong to other programs: daemon and session warn of them.
+//! Variables that begin with `AXON_` and belong to other programs: the daemon and the session warn
+//! of them.
 
 use std::{fs, fs::File};
 
 use super::*;
 use crate::support::Kept;
 
-/// A host where such a variable is set, and AXON logs what it logs unless told otherwise.
+/// A host with such a variable, and with the default logging.
 fn host() -> Host {
     Host::new().without("AXON_LOG").with("AXON_EDITOR", "hunter2")
 }
 
-/// The lines of a log that name the variable.
+/// Returns the lines of a log that name the variable.
 fn lines(log: &str) -> Vec<&str> {
     assert!(!log.contains("hunter2"), "the value may be a secret: {log}");
     log.lines().filter(|line| line.contains("AXON_EDITOR")).collect()
@@ -42,7 +43,7 @@ fn a_process_with_sessions_warns_once() {
     assert!(line.contains("WARN") && line.contains("AXON_STRICT_ENV"), "{line}");
 }
 
-/// What the child does: it shows what a program sees that collects the log of its libraries.
+/// The child: shows what a program sees that collects the log of its libraries.
 pub(crate) fn sessions() {
     let log = tracing_subscriber::fmt().with_max_level(tracing::Level::WARN);
     log.with_writer(std::io::stderr).init();

@@ -1,4 +1,4 @@
-//! The access rules of the host: each daemon obeys them, whatever process started it.
+//! The access rules of the host: each daemon obeys them, whichever process started it.
 
 use super::*;
 use crate::skip::skip;
@@ -6,7 +6,7 @@ use crate::skip::skip;
 const RULES: &str = "[[allow]]\npeer = \"*\"\npublish = \"/allowed\"\n";
 const FILE: &str = "/etc/axon/access.toml";
 
-/// A program with an `/etc` of its own that has these rules.
+/// Returns a command that runs a program with its own `/etc`, which contains these rules.
 fn with_rules(host: &Host, rules: &str, program: &str) -> std::process::Command {
     const SCRIPT: &str = "mount --make-rprivate / && mount -t tmpfs none /etc && mkdir /etc/axon && \
         printf %s \"$RULES\" >/etc/axon/access.toml && exec \"$@\"";
@@ -27,7 +27,7 @@ fn can_have_rules(host: &Host) -> bool {
     false
 }
 
-/// A session of a process whose environment names no rules.
+/// Starts a session of a process whose environment names no rules.
 fn idle(host: &Host, rules: &str) -> Player {
     let own = std::env::current_exe().unwrap();
     host.play_in(with_rules(host, rules, own.to_str().unwrap()), "idle")

@@ -1,11 +1,11 @@
-//! Who says what no session says, or hands over what nobody should read.
+//! Peers that send what no session sends, or pass descriptors that must not be read.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::*;
 use crate::reluctant::{hiding, send_away};
 
-/// What a tool says first.
+/// The first message of a tool.
 fn tool_hello() -> SessionMessage {
     SessionMessage::Hello(SessionHello {
         protocol: PROTOCOL,
@@ -61,24 +61,24 @@ fn garbage_on_the_control_socket_does_not_disturb_sessions() {
             )
         });
     }
-    // A crowd that says nothing at all.
+    // Many connections that send nothing.
     let crowd: Vec<OwnedFd> = (0..300).filter_map(|_| address.connect().ok()).collect();
     drop(crowd);
-    // A tool that speaks out of turn.
+    // A tool that sends a message it may not send.
     let tool = address.connect().unwrap();
     socket::send(&tool, &tool_hello().encode().unwrap(), &[]).unwrap();
     socket::send(&tool, &SessionMessage::Resync.encode().unwrap(), &[]).unwrap();
     until("the tool is put out", || {
         matches!(socket::receive(&tool, &mut Vec::new()), Err(socket::SocketError::Closed))
     });
-    // All the while the daemon serves.
+    // The daemon still serves sessions.
     let subscription = host.session("b").unwrap().create_subscription(spec("/t")).unwrap();
     assert!(subscription.wait_matched(1, PATIENCE) && publisher.wait_matched(1, PATIENCE));
     publish(&publisher, 1);
     assert_eq!(receive(&subscription), 1);
 }
 
-/// The daemon's status shows counters that it reads from what sessions handed over.
+/// The daemon's status shows counters that it reads from the memory that sessions pass to it.
 #[test]
 fn the_daemon_is_handed_nothing_that_a_read_could_wait_for() {
     let host = Host::new();
@@ -131,25 +131,25 @@ fn descriptors_that_are_slow_to_close_do_not_stop_the_daemon() {
     let daemon = host.daemon();
     let address = Address::of(&host.config());
     let tool = tool_hello();
-    // The daemon receives nothing before all is sent: one that had closed a descriptor already would leave
-    // its last close to this thread.
+    // The daemon receives nothing before everything has been sent. If it had closed a copy of a descriptor already, the
+    // last close would be this thread's.
     signal(daemon.0.id(), Signal::STOP);
     let pid = Pid::from_raw(i32::try_from(daemon.0.id()).unwrap()).unwrap();
     waitid(WaitId::Pid(pid), WaitIdOptions::STOPPED).unwrap();
     let (tool, unknown, garbage) = (tool.encode().unwrap(), [200, 0xa0], [1]);
-    // (said first, what the packet that carries it is, descriptors before it)
+    // (first message, the message that carries the descriptor, the number of descriptors before it)
     type Way<'a> = (Option<&'a [u8]>, &'a [u8], usize);
     let ways: [Way<'_>; 5] = [
         (None, &unknown, 0),
-        // More than belong into any packet.
+        // More descriptors than belong in any packet.
         (None, &unknown, 7),
         (None, &tool, 0),
         (Some(&tool), &unknown, 0),
-        // The connection is over before it is read.
+        // The connection ends before the packet is read.
         (Some(&garbage), &unknown, 0),
     ];
     let mut peers = Vec::new();
-    // More than the daemon has threads that close.
+    // More than the daemon has closing threads.
     for (first, carrier, before) in ways.into_iter().cycle().take(45) {
         let stranger = address.connect().unwrap();
         if let Some(first) = first {
@@ -160,7 +160,7 @@ fn descriptors_that_are_slow_to_close_do_not_stop_the_daemon() {
         peers.push((peer, stranger));
     }
     signal(daemon.0.id(), Signal::CONT);
-    // Who is put out hears of it.
+    // A refused peer sees the end of its connection.
     let other = address.connect().unwrap();
     socket::send(&other, &garbage, &[]).unwrap();
     until("the connection is over", || {
@@ -177,12 +177,12 @@ fn key_packets_without_a_key_end_connections_and_hold_up_no_client() {
     let host = Host::new();
     let _daemon = host.daemon();
     let address = Address::of(&host.config());
-    // The packet of a session's key, without the key, again and again from several threads.
+    // Several threads repeatedly send the packet of a session's key without the key.
     let over = AtomicBool::new(false);
     std::thread::scope(|scope| {
         for _ in 0..3 {
             scope.spawn(|| {
-                // Relaxed: nothing else is told by it.
+                // Relaxed: the flag orders nothing else.
                 while !over.load(Ordering::Relaxed) {
                     let socket = address.connect().unwrap();
                     while socket::send(&socket, &[32], &[]).is_ok() {}

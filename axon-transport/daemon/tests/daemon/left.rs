@@ -1,11 +1,12 @@
-//! What a process that ends leaves to its readers when the daemon was killed before it could pass the memory on.
+//! Readers get the samples of a process that ended after the daemon was killed, so that no daemon could pass its memory
+//! on.
 
 use std::time::Duration;
 
 use super::*;
 use crate::support::of_child;
 
-/// Samples that the publisher leaves, each longer than what it has memory ready for.
+/// Number of samples that the publisher leaves. Each is longer than the memory that is ready for it.
 const SAMPLES: u64 = 24;
 const LENGTH: usize = 300_000;
 
@@ -15,7 +16,7 @@ fn sample(number: u64) -> Vec<u8> {
     bytes
 }
 
-/// A child: publishes once it is told to, and ends.
+/// A child: publishes when the test tells it to, and ends.
 pub(crate) fn publisher() {
     let session = of_child("publisher");
     let publisher = session.create_publisher(spec("/left")).unwrap();
@@ -29,7 +30,7 @@ pub(crate) fn publisher() {
     }
 }
 
-/// A child: takes what the publisher left, and says how many samples came and how many it counts as lost.
+/// A child: takes the samples that the publisher left, and reports how many it took and how many count as lost.
 pub(crate) fn taker() {
     let session = of_child("taker");
     let subscription = session.create_subscription(spec("/left")).unwrap();
@@ -67,7 +68,7 @@ fn daemon_killed(reader_stops: bool) {
     taker.finish();
 }
 
-/// A child: answers a call once it is told to, and ends.
+/// A child: answers a call when the test tells it to, and ends.
 pub(crate) fn server() {
     let session = of_child("server");
     let server = session.create_server(spec("/left")).unwrap();

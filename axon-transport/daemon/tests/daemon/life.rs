@@ -1,4 +1,4 @@
-//! Under what circumstances a daemon is started, and what it lives through.
+//! The circumstances in which a daemon is started, and those that it survives.
 
 use std::{
     fs,
@@ -16,7 +16,7 @@ use rustix::process::{Pid, Signal, kill_process_group};
 use super::*;
 use crate::{skip::skip, support::Kept};
 
-/// A child that plays `part`, of which nothing is heard but what it does.
+/// Returns the command of a child that plays `part`. Its output is discarded.
 fn command(host: &Host, part: &str) -> Command {
     let mut command = host.command(std::env::current_exe().unwrap());
     command.args(["child", "--exact", "--nocapture", "--test-threads=1"]).env("PLAY", part);
@@ -24,7 +24,7 @@ fn command(host: &Host, part: &str) -> Command {
     command
 }
 
-/// The sessions of applications, once there are so many.
+/// Waits until there are `count` sessions of applications, and returns the status.
 fn sessions(host: &Host, count: usize) -> Status {
     let mut status = None;
     until("the sessions are there", || {
@@ -34,10 +34,10 @@ fn sessions(host: &Host, count: usize) -> Status {
     status.unwrap()
 }
 
-/// Settings, the variable among them whose file cannot be used, and that file's name.
+/// Settings, the variable that names an unusable file, and the file's name.
 type Unusable = (Vec<(&'static str, String)>, &'static str, &'static str);
 
-/// Settings that are right by themselves and name a file in `dir` that is not.
+/// Returns settings that are valid by themselves but name an unusable file in `dir`.
 fn unusable_files(dir: &Path) -> [Unusable; 3] {
     let file = |name: &str, text: &str| {
         let path = dir.join(name);
@@ -76,7 +76,7 @@ fn unusable_file_ends_a_daemon_with_status_2_and_no_traces() {
         assert_eq!((output.status.code(), text.lines().count()), (Some(2), 1), "{text}");
         assert!(text.contains(variable) && text.contains(file), "{text}");
         assert!(!host.dir.path().join("run").exists(), "something was made: {text}");
-        // A session hears the same of the daemon that it starts.
+        // A session gets the same error from the daemon that it starts.
         let said = host.play("idle").hear();
         assert!(said.contains(variable) && said.contains(file), "{said}");
         let log = host.dir.path().join("run/axon-0.log");
@@ -104,18 +104,18 @@ fn a_daemon_is_started_by_a_process_without_standard_streams() {
     let host = Host::new();
     let _player = Kept(command(&host, "streamless").spawn().unwrap());
     let status = sessions(&host, 1);
-    // Nor has it any that were not meant for it.
+    // The daemon has no streams that were meant for another use.
     let streams = (0..3).map(|fd| fs::read_link(format!("/proc/{}/fd/{fd}", status.pid)));
     let streams: Vec<_> = streams.map(|link| link.unwrap().display().to_string()).collect();
     assert_eq!(streams[..2], ["/dev/null", "/dev/null"]);
     assert!(streams[2].ends_with("run/axon-0.log"), "{streams:?}");
 }
 
-/// What the child does: it loses its streams, whose numbers are free for what a session opens.
+/// The child: closes its streams, so that descriptors of the session get their numbers.
 pub(crate) fn streamless() {
     for stream in 0..3 {
-        // SAFETY: nobody in this process uses them from here on; what takes their numbers is not
-        // written to by the harness, which this does not return to.
+        // SAFETY: nothing in this process uses the streams from here on. The harness, to which this does not return,
+        // does not write to the descriptors that get their numbers.
         unsafe { libc::close(stream) };
     }
     let session = support::of_child("streamless");
@@ -125,7 +125,7 @@ pub(crate) fn streamless() {
     );
     publish(&publisher, 1);
     assert_eq!(receive(&subscription), 1);
-    // Until the test ends it.
+    // Runs until the test kills it.
     loop {
         std::thread::park();
     }
@@ -155,7 +155,7 @@ fn missing_daemon_program_is_an_error_with_its_paths_and_remedy() {
     }
 }
 
-/// What the child does: it says what `Display` and `Debug` say, which a `main` prints.
+/// The child: reports the `Display` and `Debug` texts of the error, which a `main` prints.
 pub(crate) fn nobody_to_start() {
     let opened = Session::open(&Config::from_env().unwrap(), SessionOptions::new("nobody"));
     let Err(error) = opened else { panic!("there is no daemon, and none to start") };
@@ -209,7 +209,7 @@ fn all_works_with_256_descriptors() {
     for player in &mut players {
         assert_eq!(player.hear(), "taken");
     }
-    // The daemon is of one of them, and may have no more than they.
+    // One of the processes started the daemon, which therefore has the same limit.
     let limits = fs::read_to_string(format!("/proc/{}/limits", host.status().unwrap().pid));
     let limits = limits.unwrap();
     let files = limits.lines().find(|line| line.starts_with("Max open files")).unwrap();
@@ -217,7 +217,7 @@ fn all_works_with_256_descriptors() {
     players.into_iter().for_each(Player::finish);
 }
 
-/// What each child does.
+/// The code of each child.
 pub(crate) fn few_descriptors() {
     let few = rustix::process::Rlimit { current: Some(256), maximum: Some(256) };
     rustix::process::setrlimit(rustix::process::Resource::Nofile, few).unwrap();
@@ -241,7 +241,7 @@ pub(crate) fn few_descriptors() {
     wait_for_the_end();
 }
 
-/// The host with a daemon that counts how often it is [started].
+/// Makes the host count how often its daemon is [started].
 pub(crate) fn counting(host: Host) -> Host {
     let script = host.dir.path().join("daemon.sh");
     let text = format!(
@@ -255,13 +255,13 @@ pub(crate) fn counting(host: Host) -> Host {
     host.with("AXON_DAEMON_PATH", &script)
 }
 
-/// How often the daemon of a [counting] host was started.
+/// Returns how often the daemon of a [counting] host was started.
 pub(crate) fn started(host: &Host) -> usize {
     let count = fs::read_to_string(host.dir.path().join(STARTED));
     count.map_or(0, |count| count.lines().count())
 }
 
-/// Where a [counting] host's daemon counts.
+/// The file in which a [counting] host counts.
 const STARTED: &str = "started";
 
 #[test]
@@ -273,7 +273,7 @@ fn many_that_lose_their_daemon_do_not_each_start_one() {
     until("there is another", || host.status().is_ok_and(|next| next.daemon != first.daemon));
     sessions(&host, 20);
     let started = started(&host);
-    // Two, unless the machine is so slow that some of them lost patience.
+    // Two, unless the machine is so slow that some of them gave up waiting.
     assert!(started < 8, "{started} daemons were started");
     players.into_iter().for_each(Player::finish);
 }
@@ -310,7 +310,7 @@ fn another_version_is_refused_by_both_sides() {
     }
     drop(daemon);
 
-    // A daemon of another version, where this one's would be.
+    // A daemon of another version, at the address of this version's daemon.
     let (listeners, _lock) = Address::of(&host.config()).bind().unwrap().into_parts();
     let later = std::thread::spawn(move || {
         let mut accepted = None;
@@ -337,7 +337,8 @@ fn another_version_is_refused_by_both_sides() {
     later.join().unwrap();
 }
 
-/// Their daemon hangs meanwhile: it finds in one moment that the process ended, and what that sent before.
+/// The daemon is stopped meanwhile: it finds at once that the process ended, together with the messages that it sent
+/// before.
 #[test]
 fn all_samples_of_a_publisher_that_ends_are_taken_though_the_daemon_is_slow() {
     for _ in 0..6 {
@@ -351,7 +352,7 @@ fn all_samples_of_a_publisher_that_ends_are_taken_though_the_daemon_is_slow() {
         signal(daemon.0.id(), Signal::STOP);
         leaver.finish();
         until("the reader heard of it", || subscription.matched().is_empty());
-        // It finds that memory is missing, and sleeps.
+        // The reader finds that memory is missing, and sleeps.
         let (tell, told) = std::sync::mpsc::channel();
         std::thread::scope(|scope| {
             scope.spawn(|| {

@@ -1,4 +1,4 @@
-//! Logging never ends a daemon, and never fills a file system.
+//! Logging never ends a daemon and never fills a file system.
 
 use std::{
     fs::{self, File, OpenOptions},
@@ -25,7 +25,7 @@ use crate::{skip::skip, support::Kept};
 
 const NOBODY: libc::uid_t = 65534;
 
-/// A daemon in the foreground, given this standard error, that logs all that it does.
+/// Starts a daemon in the foreground with this standard error, which logs everything.
 fn foreground(host: &Host, mut command: Command, stderr: impl Into<Stdio>) -> Kept {
     let daemon = Kept(command.stderr(stderr).spawn().unwrap());
     until("the daemon answers", || host.status().is_ok());
@@ -36,7 +36,7 @@ fn program(host: &Host) -> Command {
     host.command(env!("CARGO_BIN_EXE_axon_daemon"))
 }
 
-/// Sessions come and go, and one connection is refused; the daemon logs each of them.
+/// Opens and closes sessions, and one connection that the daemon refuses; the daemon logs each of them.
 fn cause_log_lines(host: &Host) {
     for _ in 0..3 {
         let session = host.session("short").unwrap();
@@ -46,7 +46,7 @@ fn cause_log_lines(host: &Host) {
     }
 }
 
-/// A stranger's handshakes that the daemon refuses and logs: it speaks another protocol.
+/// Makes handshakes in another protocol, which the daemon refuses and logs.
 fn refused_handshakes(host: &Host) {
     let last = |status: &Status| status.refusals.iter().map(|refusal| refusal.at).max();
     let status = host.status().unwrap();
@@ -77,7 +77,7 @@ fn assert_it_goes_on(host: &Host, mut daemon: Kept) {
     assert!(daemon.0.try_wait().unwrap().is_none(), "the daemon runs");
 }
 
-/// Without this the tests below could pass where nothing is logged.
+/// Shows that these actions are logged. Without this test, the tests below could pass although nothing is logged.
 #[test]
 fn the_test_actions_are_logged_to_a_regular_file() {
     let host = Host::new();
@@ -117,7 +117,8 @@ fn a_daemon_outlives_the_reader_of_its_standard_error() {
 fn a_daemon_outlives_a_limit_on_the_size_of_files() {
     let host = Host::new();
     let log = host.dir.path().join("stderr");
-    // Its log file is as long as any may be. Shared memory must fit: a session's takes 17 MiB, most of it sparse.
+    // Its log file has the maximum length. Shared memory must fit in the limit: a session's takes 17 MiB, mostly
+    // sparse.
     let length = 32 << 20;
     let file = File::create(&log).unwrap();
     file.set_len(length).unwrap();
@@ -126,7 +127,7 @@ fn a_daemon_outlives_a_limit_on_the_size_of_files() {
     assert_eq!(fs::metadata(&log).unwrap().len(), length);
 }
 
-/// A runtime directory in which a daemon in the background finds its log.
+/// Prepares a runtime directory with a log for a daemon in the background.
 fn with_log(host: &Host, log: impl FnOnce(&Path)) {
     let run = host.dir.path().join("run");
     fs::create_dir(&run).unwrap();
@@ -146,7 +147,7 @@ fn a_daemon_in_the_background_starts_though_the_file_system_of_its_log_is_full()
     cause_log_lines(&host);
     refused_handshakes(&host);
     assert_eq!(host.status().expect("it answers").pid, daemon);
-    // Its end takes the log with it, and the next one starts as well.
+    // When it ends, the log is removed, and the next daemon starts as well.
     signal(daemon, Signal::KILL);
     until("it has ended", || !host.status().is_ok_and(|status| status.pid == daemon));
     let mut next = host.play("idle");
@@ -157,7 +158,7 @@ fn a_daemon_in_the_background_starts_though_the_file_system_of_its_log_is_full()
 #[test]
 fn daemon_that_may_not_write_ends_with_an_error_and_not_by_a_signal() {
     let host = Host::new();
-    // The limit is one of files, not of pipes.
+    // The limit applies to files, not to pipes.
     let (mut reader, writer) = std::io::pipe().unwrap();
     let mut daemon = Kept(limited(&host, 0).stderr(writer).spawn().unwrap());
     let mut said = String::new();
@@ -168,7 +169,7 @@ fn daemon_that_may_not_write_ends_with_an_error_and_not_by_a_signal() {
     assert!(!said.contains("panicked"), "{said}");
 }
 
-/// A daemon none of whose files may be longer.
+/// Returns the command of a daemon whose files may have at most `blocks` blocks.
 fn limited(host: &Host, blocks: u64) -> Command {
     let mut shell = host.command("sh");
     let script = format!("ulimit -f {blocks}; exec \"$0\"");
@@ -236,9 +237,9 @@ fn endless_connections_of_another_user_leave_few_log_lines() {
     let host = Host::new().with("AXON_LOG", "warn");
     let log = host.dir.path().join("stderr");
     let daemon = foreground(&host, program(&host), File::create(&log).unwrap());
-    // The daemon ends some time after its last session.
+    // A session keeps the daemon from ending.
     let session = host.session("stays").unwrap();
-    // Nobody keeps the other user out but the daemon.
+    // Only the daemon itself can keep the other user out.
     let run = host.dir.path().join("run");
     let socket = run.join("axon-0.sock");
     for path in [host.dir.path(), &run, &socket] {
@@ -247,15 +248,15 @@ fn endless_connections_of_another_user_leave_few_log_lines() {
     let address = SocketAddrUnix::new(&socket).unwrap();
     let begin = Instant::now();
     let flood = std::thread::spawn(move || {
-        // SAFETY: has no effect on memory. The system call itself changes the thread that calls it, and not
-        // the process, as the function of the C library would; the thread ends as the other user.
+        // SAFETY: the call has no effect on memory. The system call changes only the calling thread, unlike the
+        // function of the C library, which changes the process. The thread stays the other user until it ends.
         let changed = unsafe { libc::syscall(libc::SYS_setresuid, NOBODY, NOBODY, NOBODY) };
         assert_eq!(changed, 0);
         for _ in 0..CONNECTIONS {
             let (unix, packets) = (AddressFamily::UNIX, SocketType::SEQPACKET);
             let stranger = socket_with(unix, packets, SocketFlags::CLOEXEC, None).unwrap();
             connect(&stranger, &address).unwrap();
-            // Until it is put out.
+            // Until the daemon refuses it.
             while let Ok(_) | Err(socket::SocketError::NotReady) =
                 socket::receive(&stranger, &mut Vec::new())
             {
@@ -272,7 +273,7 @@ fn endless_connections_of_another_user_leave_few_log_lines() {
         "{CONNECTIONS} connections of another user in {took:?}: {lines} lines, {:.0} bytes a second",
         text.len() as f64 / took.as_secs_f64()
     );
-    // Ten at once, and then one a second.
+    // Ten lines at once, and then one per second.
     assert!((1..=10 + took.as_secs() + 1).contains(&lines), "{lines} lines in {took:?}:\n{text}");
     assert!(lines < CONNECTIONS / 10, "{lines}");
     let others = text.lines().filter(|line| line.contains("WARN") && !line.contains(CAUSE)).count();

@@ -48,7 +48,7 @@ use rustix::{
 };
 use support::{Host, PATIENCE, Player, say, signal, until, wait_for_the_end};
 
-/// Samples whose descriptors do not fit in the first segment of a session's memory.
+/// Number of samples whose descriptors do not fit in the first segment of a session's memory.
 const LEFT: u64 = 5_000;
 
 fn spec(topic: &str) -> EndpointSpec {
@@ -59,7 +59,7 @@ fn publish(publisher: &Publisher, number: u64) {
     loop {
         match publisher.publish(&number.to_le_bytes()) {
             Ok(_) => return,
-            // The reader is slow: this is what KEEP_ALL means.
+            // The reader is slow; a KEEP_ALL publisher waits for it.
             Err(PublishError::Blocked { .. }) => {}
             Err(error) => panic!("{error}"),
         }
@@ -74,7 +74,7 @@ fn receive(subscription: &Subscription) -> u64 {
     number
 }
 
-/// What the children of the tests do. In a run of the tests themselves it does nothing.
+/// The code of the children of the tests. It does nothing in a run of the tests themselves.
 #[test]
 fn child() {
     let Ok(part) = std::env::var("PLAY") else { return };
@@ -108,7 +108,7 @@ fn child() {
             say(daemon.unwrap());
             wait_for_the_end();
         }
-        // Publishes numbers until the test has enough, then says how many there were.
+        // Publishes numbers until the test has enough, then reports how many.
         "talker" => {
             let publisher = session.create_publisher(spec("/numbers")).unwrap();
             assert!(publisher.wait_matched(1, PATIENCE));
@@ -122,13 +122,13 @@ fn child() {
                     std::thread::sleep(Duration::from_millis(1));
                 }
             }
-            // The marker of the end.
+            // Marks the end.
             let last = number + 1;
             publish(&publisher, last);
             say(last);
             until("everything was taken", || publisher.matched().is_empty());
         }
-        // Publishes more than fits in the first segment of its memory, and ends at once.
+        // Publishes more samples than fit in the first segment of its memory, and ends at once.
         "leaver" => {
             let publisher = session.create_publisher(spec("/numbers")).unwrap();
             assert!(publisher.wait_matched(1, PATIENCE));
@@ -136,7 +136,7 @@ fn child() {
             wait_for_the_end();
             (1..=LEFT).for_each(|number| publish(&publisher, number));
         }
-        // Takes numbers, which must come without a gap, until the process is told the last.
+        // Takes numbers, which must come without a gap, until the test tells it the last one.
         "listener" => {
             let subscription = session.create_subscription(spec("/numbers")).unwrap();
             let first = receive(&subscription);
@@ -169,7 +169,7 @@ fn run_pair(host: &Host, meanwhile: impl FnOnce(&str)) {
     talk(host, [host.play("listener"), host.play("talker")], meanwhile);
 }
 
-/// Has a talker talk to a listener until `meanwhile`, which is told the daemon, is over.
+/// Lets a talker talk to a listener until `meanwhile` returns, which gets the daemon's id.
 fn talk(host: &Host, players: [Player; 2], meanwhile: impl FnOnce(&str)) {
     let [mut listener, mut talker] = players;
     assert_eq!(talker.hear(), "matched");
@@ -194,13 +194,13 @@ fn two_processes_talk_through_a_daemon_that_the_first_one_started() {
     let environ = std::fs::read(format!("/proc/{}/stat", status.pid)).unwrap();
     let stat = String::from_utf8(environ).unwrap();
     let fields: Vec<&str> = stat.rsplit(") ").next().unwrap().split(' ').collect();
-    // Its own session, and nobody's child among us.
+    // It is in a session of its own, and not a child of this process.
     assert_eq!(fields[3], status.pid.to_string(), "setsid");
     assert_ne!(fields[1], std::process::id().to_string(), "our child");
     let limits = std::fs::read_to_string(format!("/proc/{}/limits", status.pid)).unwrap();
     let core = limits.lines().find(|l| l.starts_with("Max core file size")).unwrap();
     assert_eq!(core.split_whitespace().nth(4), Some("0"), "{core}");
-    // The kernel gives the files of a process that is not dumpable to root. A test of root cannot tell.
+    // The kernel gives the files of a process that is not dumpable to root. A test that runs as root cannot tell.
     let own = rustix::process::geteuid().as_raw();
     let files = std::fs::metadata(format!("/proc/{}/stat", status.pid)).unwrap();
     assert!(own == 0 || std::os::unix::fs::MetadataExt::uid(&files) != own, "it is dumpable");
@@ -220,7 +220,7 @@ fn a_daemon_killed_in_the_middle_loses_nothing_and_another_takes_over() {
             });
         }
         assert_ne!(host.status().unwrap().daemon, first);
-        // Somebody who comes late is matched by the new daemon.
+        // A session that joins late is matched by the new daemon.
         let late = host.session("late").unwrap();
         let subscription = late.create_subscription(spec("/numbers")).unwrap();
         assert!(subscription.wait_matched(1, PATIENCE));
@@ -287,7 +287,7 @@ fn other_security_settings_are_refused_by_name() {
     assert_eq!((ours.as_str(), theirs.as_str()), ("chacha20-poly1305", "aes-256-gcm"));
     let status = host.status().unwrap();
     assert!(status.refusals.iter().any(|r| r.what == "AXON_QUIC_CIPHER"), "{:?}", status.refusals);
-    // The same as seen by a program.
+    // The same error, as a program sees it.
     let other = Host { env: host.env.clone(), dir: tempfile::tempdir().unwrap() }
         .with("AXON_QUIC_CIPHER", "chacha20-poly1305");
     let said = other.play("idle").hear();
@@ -328,7 +328,7 @@ fn domains_in_one_runtime_directory_have_separate_daemons() {
     });
     for (number, (subscription, publisher)) in (1..).zip(&ends) {
         assert!(subscription.wait_matched(1, PATIENCE) && publisher.wait_matched(1, PATIENCE));
-        // One sample there and two here.
+        // The first pair gets one sample, the second two.
         (1..=number).for_each(|sample| publish(publisher, sample));
     }
     for (number, (subscription, publisher)) in (1..).zip(&ends) {
@@ -361,7 +361,7 @@ fn a_session_killed_takes_its_endpoints_with_it() {
     signal(talker.pid(), Signal::KILL);
     assert!(session.wait_graph(PATIENCE, |g| g.endpoints.len() == 1));
     until("the subscription heard of it", || subscription.matched().is_empty());
-    // What the dead one left is still there to be taken.
+    // The samples of the dead process can still be taken.
     while subscription.has_data() {
         let next = receive(&subscription);
         assert_eq!(next, taken + 1);
@@ -391,7 +391,7 @@ fn a_reader_killed_does_not_hold_its_writer_up() {
 
 #[test]
 fn without_a_usable_runtime_directory_nothing_is_kept_and_everything_works() {
-    // The abstract name is the user's and the domain's: a domain that no other test has.
+    // The abstract name is unique per user and domain, so the test uses a domain of its own.
     let host = Host::new()
         .without("AXON_RUNTIME_DIR")
         .with("XDG_RUNTIME_DIR", "/proc/no-such-directory")
@@ -399,7 +399,7 @@ fn without_a_usable_runtime_directory_nothing_is_kept_and_everything_works() {
     run_pair(&host, |daemon| keeps_nothing(&host, daemon));
 }
 
-/// That this daemon, which a session started, has no directory, and an address that is no file.
+/// Asserts that this daemon, which a session started, has no directory, and an address that is not a file.
 fn keeps_nothing(host: &Host, daemon: &str) {
     let status = host.status().unwrap();
     assert_eq!((&*status.daemon, status.runtime_dir), (daemon, None));
@@ -412,7 +412,7 @@ fn a_daemon_that_does_not_start_is_an_error_with_its_reason() {
     let said = host.play("idle").hear();
     assert!(said.contains("/bin/false did not start"), "{said}");
 
-    // The daemon is stricter than the session here: the directory is another user's to write to.
+    // The daemon is stricter than the session here: other users can write to the directory.
     let host = Host::new();
     let run = host.dir.path().join("run");
     std::fs::create_dir(&run).unwrap();
@@ -443,7 +443,7 @@ fn a_second_daemon_by_hand_says_that_there_is_one() {
     assert!(text.contains("another daemon"), "{text}");
 }
 
-/// A gateway that stands, and then fails at once.
+/// A gateway that starts and then panics.
 fn failing_gateway(parts: GatewayParts) -> Result<(), String> {
     parts.control.blocking_send(ToControl::Started { port: 1 }).unwrap();
     panic!("as a gateway may")
@@ -470,7 +470,7 @@ fn a_panicked_gateway_is_restarted_without_disturbing_sessions() {
         drop(subscription);
         until("the reader is gone", || publisher.matched().is_empty());
     }
-    // It would end when nobody needs it; the test need not wait for that.
+    // It would end when no session needs it; the test need not wait for that.
     assert!(!daemon.is_finished());
 }
 
@@ -495,7 +495,7 @@ fn a_daemon_in_the_foreground_stays_until_sigterm() {
             status.sessions.iter().all(|session| session.name != "visitor")
         });
     }
-    // A daemon that does not stay ends at once, without a grace time.
+    // Without a grace time, a daemon in the background would end at once.
     std::thread::sleep(Duration::from_millis(500));
     assert_eq!(host.status().unwrap().pid, daemon.0.id());
     signal(daemon.0.id(), Signal::TERM);
@@ -512,7 +512,7 @@ fn a_daemon_that_a_session_started_ends_when_no_session_needs_it() {
     until("the daemon ends", || matches!(host.status(), Err(SessionError::NoDaemon { .. })));
 }
 
-/// A host whose daemons outlive their last session by some seconds.
+/// Makes the daemons of the host stay for some seconds after their last session.
 fn with_grace(host: Host, seconds: u32) -> Host {
     let toml = host.dir.path().join("axon.toml");
     std::fs::write(&toml, format!("[link]\ngrace_s = {seconds}\n")).unwrap();

@@ -1,16 +1,16 @@
-//! A reader that was stopped, and that never heard of a publisher that had counted it: what it lost is counted.
+//! A reader that was stopped, and was never told of a publisher that had counted it: the reader counts what it lost.
 
 use std::time::{Duration, Instant};
 
 use super::*;
 use crate::support::of_child;
 
-/// Samples that the publisher leaves.
+/// Number of samples that the publisher leaves.
 const SAMPLES: u64 = 24;
-/// How long a publisher that was dropped stays for a reader, and more.
+/// Longer than a dropped publisher stays for a reader.
 const PUBLISHER_STAYS: Duration = Duration::from_secs(12);
 
-/// How a publisher ends.
+/// The way in which a publisher ends.
 #[derive(PartialEq)]
 enum End {
     Publisher,
@@ -18,7 +18,7 @@ enum End {
     Killed,
 }
 
-/// A child: publishes once it has a reader, and ends its publisher, or all of it, or waits to be killed.
+/// A child: publishes once it has a reader. Then it ends its publisher or itself, or waits to be killed.
 fn publish_and(end: &End) {
     let session = of_child("publisher");
     let publisher = session.create_publisher(spec("/unmet")).unwrap();
@@ -27,7 +27,7 @@ fn publish_and(end: &End) {
     say("matched");
     (1..=SAMPLES).for_each(|number| publish(&publisher, number));
     if *end == End::Killed {
-        // The next daemon has heard all that there is to hear of it.
+        // The next daemon has been told everything about this process.
         until("a daemon answers", || session.status_json().is_ok());
         say("published");
         wait_for_the_end();
@@ -44,17 +44,17 @@ pub(crate) fn killed() {
     publish_and(&End::Killed);
 }
 
-/// A child: ends its publisher and lives.
+/// A child: ends its publisher and lives on.
 pub(crate) fn publisher() {
     publish_and(&End::Publisher);
 }
 
-/// A child: ends with its publisher.
+/// A child: ends, and its publisher with it.
 pub(crate) fn process() {
     publish_and(&End::Process);
 }
 
-/// A child: says how many samples came, and how many it counts as lost, once it knows of all of them.
+/// A child: reports how many samples came and how many count as lost, once all are accounted for.
 pub(crate) fn taker() {
     let session = of_child("taker");
     let subscription = session.create_subscription(spec("/unmet")).unwrap();
@@ -72,7 +72,7 @@ pub(crate) fn taker() {
     wait_for_the_end();
 }
 
-/// The daemon is killed between the question of a reader, which is stopped then, and the publisher's answer.
+/// Stops a reader after its request, and kills the daemon before the publisher's answer.
 fn publisher_of_a_stopped_reader(part: &str, meanwhile: impl FnOnce(Player)) {
     let host = Host::new();
     let mut publisher = host.play(part);

@@ -1,5 +1,5 @@
-//! Each of the eleven events tells its callback: at once of what nobody was told of, then of each
-//! occurrence, and of none once it is unset.
+//! Each of the eleven events calls its callback: at once for occurrences that were not reported, then for each
+//! occurrence, and no more once it is unset.
 
 use std::{
     any::Any,
@@ -21,27 +21,27 @@ use super::{
     support::{PATIENCE, until},
 };
 
-/// Makes an event occur once, by an endpoint of this GID; or, without one, at least once before long.
+/// Makes an event occur once, through the returned endpoint. If it returns `None`, the event occurs at least once soon.
 type Cause<'a> = Box<dyn FnMut() -> Option<Gid> + 'a>;
 
-/// An event, and what makes it occur.
+/// An event, and the code that makes it occur.
 struct Scene<'a> {
     event: Event,
     session: &'a Session,
     cause: Cause<'a>,
-    /// What it is about.
+    /// The endpoints of the event.
     _cast: Box<dyn Any>,
 }
 
 fn scene(kind: EventKind, pair: &Pair) -> Scene<'_> {
     let (here, there) = (&pair.here, &pair.there);
     let (offered, requested) = (less()[0].1, less()[0].2);
-    // Those of before may not have gone everywhere.
+    // Endpoints of earlier scenes may not be gone everywhere yet, so each scene has its own topic.
     let spec = |qos| spec(qos).topic(format!("/{kind:?}"));
     let other = |qos| spec(qos).type_name("U");
     let plain = Qos::default;
-    // Publishers and subscriptions that come one after another, and stay. Within a session, the one that
-    // comes is the last to be told.
+    // Publishers and subscriptions are created one after another and stay. Within a session, the new endpoint is the
+    // last to be told.
     let publishers = |spec: EndpointSpec, theirs: EventKind| {
         let mut all = Vec::new();
         move || {
@@ -108,7 +108,7 @@ fn scene(kind: EventKind, pair: &Pair) -> Scene<'_> {
             let cause = move || {
                 if kind == EventKind::MessageLost {
                     flood(&publisher);
-                    // Only a thread that takes or waits looks for lost samples.
+                    // Only a thread that takes or waits detects lost samples.
                     while taker.take(&mut Vec::new()).is_some() {}
                 } else {
                     publisher.publish(b"and no more").unwrap();
@@ -140,10 +140,11 @@ fn scene(kind: EventKind, pair: &Pair) -> Scene<'_> {
 }
 
 impl Scene<'_> {
-    /// Makes it occur, and waits until it has.
+    /// Makes the event occur, and waits until it has.
     fn occur(&mut self) {
         match (self.cause)() {
-            // What another session's endpoint is to one's own has been counted when the graph shows it.
+            // When the graph shows an endpoint of another session, its effect on this session's endpoint has been
+            // counted.
             Some(gid) => {
                 let shown = self.session.wait_graph(PATIENCE, |g| g.endpoints.contains_key(&gid));
                 assert!(shown);
@@ -153,7 +154,7 @@ impl Scene<'_> {
     }
 }
 
-/// Who was told how often, one call after another.
+/// The calls of a callback in order: the thread and the number of new occurrences.
 type Calls = Arc<Mutex<Vec<(ThreadId, u64)>>>;
 
 fn recorder() -> (NewDataCallback, Calls) {
@@ -166,7 +167,7 @@ fn told(calls: &Calls) -> Vec<u64> {
     calls.lock().unwrap().iter().map(|(_, new)| *new).collect()
 }
 
-/// How often it occurred in all, where it says so.
+/// Returns the total number of occurrences, for events that count them.
 fn total(event: &Event) -> Option<u64> {
     match event.take() {
         EventStatus::Counted(status) => Some(status.total),
@@ -197,7 +198,7 @@ fn each_of_the_eleven_tells_its_callback() {
     }
 }
 
-/// Of an event that occurs once by each cause.
+/// Checks an event that occurs once for each cause.
 fn each_is_told_once(scene: &mut Scene<'_>) {
     scene.occur();
     scene.occur();
@@ -225,7 +226,7 @@ fn each_is_told_once(scene: &mut Scene<'_>) {
     assert_eq!(told(&calls), [2, 1, 1]);
 }
 
-/// Of an event that occurs at times of its own, or several times at once.
+/// Checks an event that occurs at its own times, or several times at once.
 fn each_is_told_in_all(scene: &mut Scene<'_>) {
     scene.occur();
     let (callback, calls) = recorder();
@@ -235,7 +236,7 @@ fn each_is_told_in_all(scene: &mut Scene<'_>) {
     let before = told(&calls).len();
     scene.occur();
     until("it is told", || told(&calls).len() > before);
-    // Periods go on: it is told of all that has been counted, sooner or later.
+    // Periods go on. In the end, the callback has been told of everything that was counted.
     until("it is told of all", || {
         let counted = total(&scene.event);
         counted == Some(told(&calls).iter().sum())

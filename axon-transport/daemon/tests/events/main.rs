@@ -1,5 +1,5 @@
-//! What endpoints report of themselves: the eleven events, by status and by callback, within a session and
-//! between two that a daemon brings together.
+//! The events of endpoints: all eleven, by status and by callback, within a session and between two sessions that a
+//! daemon connects.
 
 #[path = "../support/alone.rs"]
 mod alone;
@@ -141,7 +141,7 @@ fn a_callback_is_told_of_the_backlog_and_then_of_each() {
     assert_eq!(told.load(Ordering::SeqCst), 0, "it has been looked at");
 }
 
-/// Each policy, where a publisher offers less than a subscription requests in it and in nothing else.
+/// For each policy, a pair in which the publisher offers less than the subscription requests in that policy alone.
 fn less() -> [(Incompatible, Qos, Qos); 5] {
     let (least, period) = (Qos::sensor_data(), Some(3_600_000 * MILLI));
     let longer = Some(7_200_000 * MILLI);
@@ -159,7 +159,7 @@ fn less() -> [(Incompatible, Qos, Qos); 5] {
 fn incompatible_profiles_are_reported_at_both_ends_with_the_policy() {
     for pair in Pair::all() {
         for (policy, offered, requested) in less() {
-            // Those before may not have gone everywhere.
+            // Endpoints of earlier rounds may not be gone everywhere yet, so each round has its own topic.
             let spec = |qos| spec(qos).topic(format!("/{policy}"));
             let publisher = pair.here.create_publisher(spec(offered)).unwrap();
             let offers = of_publisher(&publisher, EventKind::OfferedQosIncompatible);
@@ -221,12 +221,12 @@ fn every_lost_sample_is_counted_with_or_without_a_take() {
     }
 }
 
-/// Keeps what there is room for, and waits for nobody.
+/// A profile that keeps what fits and waits for nobody.
 fn lossy() -> Qos {
     Qos::keep_all().with_reliability(Reliability::BestEffort)
 }
 
-/// More samples than a ring has room for.
+/// More samples than fit in a ring.
 const FLOOD: u64 = 40_000;
 
 fn flood(publisher: &Publisher) {
@@ -256,7 +256,7 @@ fn deadlines_are_missed_at_both_ends_from_the_first_sample_on() {
             assert!(second.total > first.total, "one for every period");
             assert_eq!(second.change, second.total - first.total);
         }
-        // Without a publisher nobody is late.
+        // Without a publisher, no deadline is missed.
         drop(publisher);
         until("it is gone", || subscription.matched().is_empty());
     }
@@ -267,7 +267,7 @@ fn a_lease_that_is_not_asserted_runs_out_and_comes_back() {
     for pair in Pair::all() {
         let (liveliness, lease) = (Liveliness::ManualByTopic, Some(50 * MILLI));
         let manual = Qos::default().with_liveliness(liveliness, lease);
-        // One that asks for no lease is told all the same.
+        // A subscription that requests no lease is told as well.
         let (publisher, subscription) = pair.matched(manual, Qos::default());
         let changed = of_subscription(&subscription, EventKind::LivelinessChanged);
         let lost = of_publisher(&publisher, EventKind::LivelinessLost);
@@ -311,7 +311,7 @@ fn a_sample_older_than_its_lifespan_is_not_delivered() {
     let long = session.create_publisher(spec(mortal(3_600_000 * MILLI))).unwrap();
     let immortal = session.create_publisher(spec(Qos::default())).unwrap();
     let subscription = session.create_subscription(spec(Qos::keep_all())).unwrap();
-    // The wall clock, by which the one is of 1970 and the other of 2262, does not matter. In a
+    // The wall clock does not matter; by it one sample is from 1970 and the other from 2262. The samples are in a
     // descriptor, in a block and in a slot.
     for len in [8, 88, 89, 96, 97, 20_000] {
         short.publish_at(from_unix_nanos(i64::MAX), &vec![1; len]).unwrap();

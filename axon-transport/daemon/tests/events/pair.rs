@@ -1,4 +1,4 @@
-//! Two sessions, or one that plays both.
+//! Two sessions, or one session in both roles.
 
 use axon_transport::{EndpointSpec, Publisher, Session, Subscription, qos::Qos};
 
@@ -11,7 +11,7 @@ use super::{
 pub(super) struct Pair {
     pub(super) here: Session,
     pub(super) there: Session,
-    /// In the order in which they end.
+    /// Dropped in this order.
     _daemon: Option<(Kept, Host)>,
 }
 
@@ -22,7 +22,7 @@ impl Pair {
         Self { here: session.clone(), there: session, _daemon: None }
     }
 
-    /// Two sessions of one daemon, which share what two processes do.
+    /// Two sessions of one daemon, which share as much as sessions of two processes.
     pub(super) fn apart() -> Self {
         let host = Host::new();
         let daemon = host.daemon();
@@ -34,7 +34,7 @@ impl Pair {
         [Self::alone(), Self::apart()]
     }
 
-    /// A publisher and a subscription that know each other.
+    /// Creates a publisher and a subscription, and waits until they are matched.
     pub(super) fn matched(&self, offered: Qos, requested: Qos) -> (Publisher, Subscription) {
         self.matched_as(spec(offered), spec(requested))
     }

@@ -1,4 +1,5 @@
-//! A random program of publishers and subscriptions that come and go, against ROS 2's rules.
+//! A random program of publishers and subscriptions that come and go, checked against ROS 2's
+//! rules.
 
 use std::collections::BTreeMap;
 
@@ -19,7 +20,7 @@ use super::{
 enum Step {
     Publisher(Typed),
     Subscription(Typed),
-    /// Ends the one that this number comes to.
+    /// Ends the endpoint at this index, modulo their number.
     End(u8),
 }
 
@@ -43,7 +44,7 @@ fn typed() -> impl Strategy<Value = Typed> {
                 ..Profile::default()
             },
             type_name: ["T", "T", "U"][usize::from(type_name)],
-            // Not everybody knows it.
+            // An endpoint may not know the hash.
             hash: vec![hash; usize::from(hash)],
         },
     )
@@ -67,7 +68,7 @@ struct Living {
     typed: Typed,
 }
 
-/// What two of them are to each other.
+/// The relation of two endpoints.
 enum Relation {
     None,
     Match,
@@ -75,7 +76,7 @@ enum Relation {
     Type,
 }
 
-/// What one endpoint must report.
+/// What an endpoint must report.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 struct Expected {
     matched: Vec<Gid>,
@@ -107,7 +108,7 @@ impl Living {
         }
     }
 
-    /// `None` where it changes meanwhile.
+    /// Returns what the endpoint reports; `None` if it changes meanwhile.
     fn reported(&self) -> Option<Expected> {
         let (mut matched, events) = match &self.ends {
             Ends::Publisher(p) => (

@@ -1,4 +1,4 @@
-//! What is around the doomed process: a fork of it, and what the system refuses it.
+//! The situation of the doomed process: a fork of it, or resources that the system refuses to it.
 #![allow(unsafe_code)]
 
 use std::{
@@ -20,27 +20,27 @@ use rustix::{
 
 use crate::group::{self, Group};
 
-/// Too little for any sample: rings leave more than that to others.
+/// Bytes of memory that are too few for any sample, because rings leave more than that to other processes.
 const LITTLE: u64 = 6 << 20;
 const DESCRIPTORS: u64 = 256;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Around {
     Nothing,
-    /// A child that it has forked holds all its descriptors, and lives on.
+    /// A forked child of the process holds all its descriptors and lives on.
     Child,
-    /// It is stopped for a while, and not killed.
+    /// The process is stopped for a while instead of killed.
     Stopped,
-    /// All its memory is locked, also what it maps from now on.
+    /// All memory of the process is locked, including later maps.
     Locked,
-    /// It may have 256 descriptors, and has them.
+    /// The process may have 256 descriptors, and all are in use.
     NoDescriptor,
-    /// Its control group has no memory left.
+    /// The control group of the process has no memory left.
     NoMemory,
 }
 
 impl Around {
-    /// In the doomed process, just before the operation.
+    /// Creates the situation. Called in the doomed process, just before the operation.
     pub(crate) fn begin(self) {
         self.try_begin().expect("what was tried before");
     }
@@ -49,7 +49,7 @@ impl Around {
         match self {
             Self::Nothing | Self::Stopped => Ok(()),
             Self::Child => {
-                // SAFETY: this process has one thread; its child does nothing but to wait for its end.
+                // SAFETY: this process has one thread, and its child only waits for its end.
                 if let ForkResult::Child = unsafe { fork() }? {
                     loop {
                         pause();
@@ -57,7 +57,7 @@ impl Around {
                 }
                 Ok(())
             }
-            // SAFETY: takes plain flags.
+            // SAFETY: the call takes only flags.
             Self::Locked => match unsafe { libc::mlockall(libc::MCL_CURRENT | libc::MCL_FUTURE) } {
                 0 => Ok(()),
                 _ => Err(io::Error::last_os_error()),
@@ -67,7 +67,7 @@ impl Around {
                 setrlimit(Resource::Nofile, limit)?;
                 loop {
                     match dup(io::stderr()) {
-                        // It stays open.
+                        // The descriptor stays open.
                         Ok(fd) => std::mem::forget(fd),
                         Err(Refusal::MFILE) => return Ok(()),
                         Err(errno) => return Err(errno.into()),
@@ -78,7 +78,7 @@ impl Around {
         }
     }
 
-    /// Why it cannot be had here, if it cannot. Asks a child process.
+    /// Tries the situation in a child process. Returns the reason if it is not possible here.
     pub(crate) fn refused(self) -> Option<String> {
         if self == Self::Child {
             return None;
@@ -107,7 +107,7 @@ impl Around {
 
 static GROUP: Mutex<Option<Group>> = Mutex::new(None);
 
-/// The control group that has no memory left; made when it is asked for first.
+/// Returns the control group without memory, which the first call creates.
 fn group() -> io::Result<PathBuf> {
     let mut group = GROUP.lock().unwrap_or_else(PoisonError::into_inner);
     if group.is_none() {

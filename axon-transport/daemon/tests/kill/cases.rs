@@ -1,4 +1,4 @@
-//! The operations and the situations that they are killed in.
+//! The operations, and the situations in which they are killed.
 
 use axon_transport::qos::{Durability, History, Qos};
 
@@ -98,19 +98,19 @@ pub(crate) fn cases() -> Vec<Case> {
         case("skip", Skip, last(4), (3, 1), 1024),
         case("drop the reader", DropReader, last(4), (3, 1), 300),
         case("drop the reader, KEEP_ALL", DropReader, all, (8, 2), 1024),
-        // A fork keeps its descriptors.
+        // A forked child keeps the descriptors.
         case("forked: attach a reader", Attach, last(4), (0, 0), 40).around(Child),
         case("forked: publish inline", Publish, last(4), (3, 1), 8).around(Child),
         case("forked: drop the publisher", DropWriter, last(4), (3, 1), 300).around(Child),
         case("forked: map a ring", Map, last(4), (3, 0), 300).around(Child),
         case("forked: pin a large one", Pin, last(4), (3, 1), 5000).around(Child),
-        // It is not killed, but stopped, and goes on later.
+        // The process is not killed but stopped, and continues later.
         case("stopped: attach a reader", Attach, last(4), (0, 0), 40).around(Stopped),
         case("stopped: publish by copy", Publish, last(4), (3, 1), 1024).around(Stopped),
         case("stopped: map a ring", Map, last(4), (3, 0), 300).around(Stopped),
         case("stopped: take inline", Take, last(4), (3, 1), 60).around(Stopped),
         case("stopped: pin a large one", Pin, last(4), (3, 1), 4200).around(Stopped),
-        // What the system refuses.
+        // Resources that the system refuses.
         case("mlockall: map a ring of large ones", Map, last(4), (3, 0), 5000).around(Locked),
         case("mlockall: pin a large one", Pin, last(4), (3, 1), 5000).around(Locked),
         case("no descriptor: publish inline", Publish, last(4), (3, 1), 8).around(NoDescriptor),

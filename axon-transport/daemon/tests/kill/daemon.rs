@@ -1,7 +1,7 @@
 //! The daemon dies in the middle of an attachment.
 //!
-//! What others see of a daemon it does by system calls, so killing it before and after each of them
-//! stands for killing it at every instruction.
+//! A daemon affects other processes only by system calls. So killing it before and after each system call is as good as
+//! killing it at every instruction.
 
 use std::{
     collections::BTreeSet,
@@ -27,9 +27,9 @@ use crate::{
     survivor::Holdings,
 };
 
-/// What the table calls it.
+/// Its name in the table.
 pub(crate) const NAME: &str = "daemon: attach a reader";
-/// Kills of a bounded run.
+/// Number of kills of a bounded run.
 const BOUNDED: u64 = 6;
 
 pub(crate) fn run(full: bool) -> Report {
@@ -51,7 +51,7 @@ pub(crate) fn run(full: bool) -> Report {
     }
 }
 
-/// A publisher and a subscription, each of a session of its own.
+/// A publisher and a subscription, each in its own session.
 struct Pair {
     publisher: Publisher,
     subscription: Subscription,
@@ -74,7 +74,7 @@ impl Pair {
         !self.publisher.matched().is_empty() && !self.subscription.matched().is_empty()
     }
 
-    /// Every sample comes, once.
+    /// Checks that every sample arrives exactly once.
     fn pass(&mut self, count: u64) {
         let mut bytes = Vec::new();
         for _ in 0..count {
@@ -89,8 +89,8 @@ impl Pair {
     }
 }
 
-/// Attaches a reader, and kills the daemon after `point` stops of its. How many there were, and
-/// whether the two were attached before another daemon came.
+/// Attaches a reader, and kills the daemon at its stop number `point`. Returns the number of stops, and whether the two
+/// were attached before the next daemon started.
 fn attach(point: Option<u64>) -> (u64, bool) {
     let before = Holdings::now();
     let host = Host::new().with("AXON_LOG", "error");
@@ -103,14 +103,14 @@ fn attach(point: Option<u64>) -> (u64, bool) {
     let (mut pair, stops) = trace(&daemon, point, move || Pair::new(both, "/attached"));
     let attached = pair.is_matched();
     drop(daemon);
-    // What is attached goes on without a daemon.
+    // Attached pairs go on without a daemon.
     known.pass(3);
     let _another = host.daemon();
     until("the two are attached", || pair.is_matched());
     pair.pass(3);
     known.pass(3);
     drop((pair, known, _another, host));
-    // Descriptors are closed by a thread of their own.
+    // Another thread closes descriptors.
     let start = Instant::now();
     while Holdings::now() != before && start.elapsed() < PATIENCE {
         thread::sleep(Duration::from_millis(5));
@@ -119,8 +119,8 @@ fn attach(point: Option<u64>) -> (u64, bool) {
     (stops, attached)
 }
 
-/// Has a thread make a pair while the daemon is traced, which is killed after `point` stops, or when
-/// the two are attached. The pair, and how many stops there were.
+/// Makes a pair in a thread while the daemon is traced. The daemon is killed after `point` stops, or when the two are
+/// attached. Returns the pair and the number of stops.
 fn trace(daemon: &Kept, point: Option<u64>, make: impl FnOnce() -> Pair + Send) -> (Pair, u64) {
     let pid = Pid::from_raw(i32::try_from(daemon.0.id()).expect("a pid"));
     for thread in threads(pid) {
@@ -152,7 +152,7 @@ fn trace(daemon: &Kept, point: Option<u64>, make: impl FnOnce() -> Pair + Send) 
         kill(pid, Signal::SIGKILL).expect("a daemon");
         loop {
             match waitpid(None, Some(WaitPidFlag::__WALL)) {
-                // The first of its threads is the last to be reaped.
+                // The main thread is reaped last.
                 Ok(WaitStatus::Signaled(thread, ..)) if thread == pid => break,
                 Ok(_) => {}
                 Err(errno) => panic!("daemon {pid}: {errno}"),
@@ -162,7 +162,8 @@ fn trace(daemon: &Kept, point: Option<u64>, make: impl FnOnce() -> Pair + Send) 
     })
 }
 
-/// Waits a little for any of its threads, and lets it go on. Whether it stopped at a system call.
+/// Checks once for a stop of any of its threads, and continues the thread. Returns whether the stop was at a system
+/// call.
 fn step(pid: Pid) -> bool {
     match waitpid(None, Some(WaitPidFlag::__WALL | WaitPidFlag::WNOHANG)) {
         Ok(WaitStatus::PtraceSyscall(thread)) => {

@@ -1,20 +1,20 @@
 //! Kills a process at each instruction of each operation on shared memory, and checks that the
 //! process at the other end loses, tears and leaks nothing.
 //!
-//! Each case is first walked: one process is stepped through the operation, and wherever a segment
-//! that it writes has changed there is a new state that a death may leave behind. A death between
-//! two such states leaves the first of them, so killing once in each state stands for killing at
-//! every instruction. One that copies thousands of bytes may be stopped after each of them: after a
-//! few hundred, a kill at its end stands for the rest. The bounded run kills around the states, all of
-//! them where they are few, and at instructions chosen at random; the full run
-//! (`cargo test --release -p axon-daemon --test kill -- --full`) at every single instruction, or
-//! evenly over an operation of very many and around its states. A part of a name runs the cases that
-//! have it in theirs. `--steps=200000` is a full run that takes so many steps at about each operation,
-//! not 2,000,000: for a slow machine.
+//! Each case is first walked: one process is stepped through the operation. Wherever a segment that it writes has
+//! changed, there is a new state that a death may leave behind. A death between two such states leaves the first of
+//! them, so one kill in each state is as good as a kill at every instruction. An instruction that copies thousands of
+//! bytes may stop after each byte; after a few hundred bytes, one kill at its end replaces the rest.
 //!
-//! Some cases have something else around them: a fork of the doomed process that keeps its
-//! descriptors, `mlockall`, no descriptors, no memory; or it is stopped where it would be killed, and
-//! goes on later. The daemon is killed before and after each of its system calls.
+//! The bounded run kills around the states (all of them, if they are few) and at random instructions. The full run
+//! (`cargo test --release -p axon-daemon --test kill -- --full`) kills at every single instruction, or, in an operation
+//! of very many instructions, at even distances and around its states. An argument that is part of a name runs the
+//! cases with that part in their names. `--steps=200000` is a full run with about that many steps per operation instead
+//! of 2,000,000, for a slow machine.
+//!
+//! Some cases have a situation: a fork of the doomed process keeps its descriptors, `mlockall` is active, or no
+//! descriptors or no memory are left; or the process is stopped at the point where it would be killed, and continues
+//! later. The daemon is killed before and after each of its system calls.
 #![expect(clippy::print_stdout, reason = "what it prints is its result")]
 
 mod around;
@@ -47,7 +47,7 @@ use worker::{Plan, STEPS};
 
 fn main() -> ExitCode {
     let arguments: Vec<String> = env::args().skip(1).collect();
-    // Before any thread is made: a worker forks.
+    // Before any thread is started, because a worker forks.
     if let Some(share) = arguments.iter().find_map(|a| a.strip_prefix("--worker=")) {
         worker::run(&Plan::parse(share));
         return ExitCode::SUCCESS;
@@ -79,7 +79,7 @@ fn main() -> ExitCode {
     conduct(&chosen, is_meant(daemon::NAME), steps)
 }
 
-/// Shares the cases out among as many workers as there are processors, and prints what they found.
+/// Distributes the cases to as many workers as there are processors, and prints their reports.
 fn conduct(chosen: &[usize], daemon: bool, steps: Option<u64>) -> ExitCode {
     let start = Instant::now();
     let workers = thread::available_parallelism().map_or(1, usize::from).min(chosen.len());

@@ -1,4 +1,4 @@
-//! What the doomed process does.
+//! The operations of the doomed process.
 
 use std::{
     io::Write as _,
@@ -21,7 +21,7 @@ use crate::{around::Around, trace::mark, wire::Wire};
 pub(crate) const LARGEST: u64 = 1 << 16;
 /// Bytes of history that a publisher may keep.
 const BUDGET: u64 = 8 << 10;
-/// Samples that a publisher which was stopped publishes once it goes on.
+/// Number of samples that a stopped publisher publishes after it continues.
 pub(crate) const MORE: u64 = 5;
 
 /// One operation in one situation.
@@ -30,45 +30,46 @@ pub(crate) struct Case {
     pub(crate) operation: Operation,
     pub(crate) publisher: Qos,
     pub(crate) reader: Qos,
-    /// Samples published before the operation, and their length and the operation's in bytes.
+    /// Number of samples published before the operation; `len` is the length in bytes of these and of the operation's
+    /// sample.
     pub(crate) before: u64,
     pub(crate) len: usize,
-    /// Samples taken before the operation.
+    /// Number of samples taken before the operation.
     pub(crate) taken: u64,
-    /// Samples taken after those, and kept pinned by the survivor.
+    /// Number of samples taken after those, which the survivor keeps pinned.
     pub(crate) pinned: u64,
     pub(crate) around: Around,
-    /// Whether it has so many instructions that a bounded run does not look for its states.
+    /// True if the operation has so many instructions that a bounded run does not walk it.
     pub(crate) long: bool,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Operation {
-    // The publisher dies in these.
+    // In these operations the publisher dies.
     Create,
     Attach,
     Publish,
-    /// To a reader that sleeps.
+    /// Publishes to a reader that sleeps.
     Wake,
-    /// Of which a KEEP_ALL reader has no room for more.
+    /// Publishes a sample for which a KEEP_ALL reader leaves no room.
     PublishHeld,
-    /// For which something is short.
+    /// Publishes a sample for which a resource is short.
     PublishRefused,
     LoanAndPublish,
     LoanAndDrop,
     Detach,
     DropWriter,
-    /// Memory is made ready for the next large sample.
+    /// Prepares memory for the next large sample.
     Prepare,
-    /// Memory of large samples that nobody needs any more is given up.
+    /// Releases memory of large samples that nobody needs.
     Tend,
-    // The reader dies in these.
+    // In these operations the reader dies.
     Map,
     Take,
-    /// A large sample is taken where it is.
+    /// Takes a large sample in place.
     Pin,
     Unpin,
-    /// The same when the reader is gone already.
+    /// Drops such a sample after its reader.
     UnpinLast,
     Peek,
     Skip,
@@ -81,7 +82,7 @@ impl Operation {
         !matches!(self, Map | Take | Pin | Unpin | UnpinLast | Peek | Skip | DropReader)
     }
 
-    /// Samples that the operation publishes.
+    /// Returns the number of samples that the operation publishes.
     pub(crate) fn publishes(self) -> u64 {
         u64::from(matches!(self, Self::Publish | Self::Wake | Self::LoanAndPublish))
     }
@@ -102,7 +103,7 @@ pub(crate) fn meta(sequence: u64) -> Meta {
     Meta::at_nanos(sequence, sequence.cast_signed() * 7 - 3)
 }
 
-/// Bytes that differ by sequence number and place.
+/// Returns bytes that differ by sequence number and offset.
 pub(crate) fn payload(sequence: u64, len: usize) -> Vec<u8> {
     let mut state = sequence.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
     let mut next = || {
@@ -113,7 +114,7 @@ pub(crate) fn payload(sequence: u64, len: usize) -> Vec<u8> {
 }
 
 impl Case {
-    /// The life of the publisher that dies.
+    /// Runs the publisher that dies.
     pub(crate) fn publish(&self, wire: &Wire) {
         let session = session();
         if self.operation == Operation::Create {
@@ -174,7 +175,7 @@ impl Case {
             other => unreachable!("{other:?} is the reader's"),
         }
         mark();
-        // Only one that was stopped comes here.
+        // Only a stopped process gets here.
         wire.wait();
         let next = self.before + self.operation.publishes();
         for sequence in next..next + MORE {
@@ -187,7 +188,7 @@ impl Case {
         mark();
     }
 
-    /// The life of the reader that dies.
+    /// Runs the reader that dies.
     pub(crate) fn read(&self, wire: &Wire) {
         let session = session();
         let (granted, _) = wire.join(&session, self.reader);
@@ -234,7 +235,7 @@ impl Case {
         }
     }
 
-    /// What a reader that was stopped does once it goes on: it takes all, and says how much that was.
+    /// Takes all samples after a stopped reader continues, and reports how many.
     fn read_on(&self, wire: &Wire, mut reader: Reader) {
         wire.wait();
         let mut out = Vec::new();

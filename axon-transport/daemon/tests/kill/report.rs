@@ -1,19 +1,19 @@
-//! What came of a case: a line of the table.
+//! The result of a case: a line of the table.
 
 use std::fmt;
 
 #[derive(Clone, Debug)]
 pub(crate) struct Report {
     pub(crate) name: String,
-    /// Who dies.
+    /// The process that dies.
     pub(crate) dies: String,
-    /// How many there are, or of what else.
+    /// The number of instructions, or of other steps.
     pub(crate) instructions: String,
     pub(crate) states: String,
     pub(crate) kills: usize,
-    /// After how many of them the operation had come to show.
+    /// Number of kills after which the operation's sample was visible.
     pub(crate) shown: usize,
-    /// Why there were none.
+    /// The reason why there were no kills.
     pub(crate) skipped: String,
 }
 
@@ -38,7 +38,7 @@ impl Report {
         )
     }
 
-    /// As a worker says it.
+    /// Returns the line in which a worker sends the report.
     pub(crate) fn line(&self) -> String {
         let Self { name, dies, instructions, states, kills, shown, skipped } = self;
         format!("done\t{name}\t{dies}\t{instructions}\t{states}\t{kills}\t{shown}\t{skipped}")

@@ -1,4 +1,4 @@
-//! The process at the other end: what it does before the kill, and what must hold for it after.
+//! The process at the other end: its actions before the kill, and the checks after it.
 
 use std::{
     fs,
@@ -26,37 +26,37 @@ use crate::{
     wire::{Wire, options},
 };
 
-/// A survivor that sleeps for so long would sleep for ever.
+/// A survivor that sleeps for this long was not woken.
 const SLEEP: Timespec = Timespec { tv_sec: 30, tv_nsec: 0 };
 
-/// What a scene shows once the doomed process is dead.
+/// The result of a scene once the doomed process is dead.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Outcome {
-    /// Whether the operation's sample was there.
+    /// True if the operation's sample was visible.
     pub(crate) shown: bool,
-    /// Whether the operation had come to its end.
+    /// True if the operation had ended.
     pub(crate) done: bool,
 }
 
-/// The survivor and the doomed, the latter at the operation's beginning.
+/// The survivor and the doomed process, which is at the operation's beginning.
 pub(crate) struct Scene<'a> {
     case: &'a Case,
     wire: Wire,
     session: Arc<SessionSegment>,
     tracee: Tracee,
     end: End,
-    /// Those segments that the doomed process writes.
+    /// The segments that the doomed process writes.
     pub(crate) written: Vec<OwnedFd>,
-    /// Samples that the survivor keeps where they are.
+    /// Samples that the survivor keeps pinned.
     pinned: Vec<Sample>,
-    /// The survivor's sleep.
+    /// The sleep of the survivor.
     leader: Option<ExternalLeader>,
     /// Bytes of memory that the survivor's segments had before the operation.
     memory: u64,
     done: bool,
 }
 
-/// What the survivor holds.
+/// The survivor's end of the ring.
 enum End {
     Nothing,
     Waiting(Box<LateReader>),
@@ -64,7 +64,7 @@ enum End {
     Writer(Box<Writer>),
 }
 
-/// Maps a reader once the publisher has granted it, if it has.
+/// Maps a reader once the publisher has granted it. Returns `None` if it has not.
 type LateReader = dyn FnOnce(&Wire) -> Option<Reader>;
 
 impl<'a> Scene<'a> {
@@ -96,24 +96,25 @@ impl<'a> Scene<'a> {
         scene
     }
 
-    /// Lets the doomed process take up to `steps` instructions. Whether it came to the end.
+    /// Lets the doomed process execute up to `steps` instructions. Returns whether the operation
+    /// ended.
     pub(crate) fn advance(&mut self, steps: u64) -> bool {
         self.done = self.tracee.advance(steps);
         self.done
     }
 
-    /// Takes in the segments that the doomed process has opened.
+    /// Maps the segments that the doomed process has opened.
     pub(crate) fn look_for_segments(&mut self) {
         if let End::Reader(_, peer) = &self.end {
             self.written.extend(self.wire.take_segments(peer));
         }
     }
 
-    /// Kills it and checks all that must hold.
+    /// Kills the doomed process, and checks everything that must hold.
     pub(crate) fn kill(mut self) -> Outcome {
         self.tracee.end();
         self.look_for_segments();
-        // What it forked lives until the very end.
+        // The forked child lives until the very end.
         let Self { case, wire, session, end, tracee: _tracee, pinned, leader, done, .. } = self;
         let shown = match end {
             End::Nothing => false,
@@ -130,7 +131,7 @@ impl<'a> Scene<'a> {
         };
         pinned.iter().for_each(|sample| check(case, sample));
         if shown && let Some(leader) = &leader {
-            // It did not live to ring, perhaps.
+            // The process may have died before it rang.
             let mut fds = [PollFd::new(leader, PollFlags::IN)];
             assert_eq!(poll(&mut fds, Some(&SLEEP)), Ok(1), "the survivor sleeps for ever");
         }
@@ -138,8 +139,8 @@ impl<'a> Scene<'a> {
         Outcome { shown, done }
     }
 
-    /// Leaves it where it stands for a while, in which others must get on without it, and then lets
-    /// it go on to its end, where it must have all that it would have had otherwise.
+    /// Leaves the doomed process stopped for a while, in which others must continue without it.
+    /// Then lets it finish; in the end it must have everything that it would have had otherwise.
     pub(crate) fn stop(mut self) -> Outcome {
         let case = self.case;
         let mut published = case.before + case.operation.publishes();
@@ -184,7 +185,7 @@ impl<'a> Scene<'a> {
     }
 }
 
-/// The survivor reads.
+/// Prepares a survivor that reads.
 fn join(case: &Case, wire: &Wire, session: &Arc<SessionSegment>) -> (End, Vec<OwnedFd>) {
     match case.operation {
         Operation::Create => (End::Nothing, Vec::new()),
@@ -194,7 +195,8 @@ fn join(case: &Case, wire: &Wire, session: &Arc<SessionSegment>) -> (End, Vec<Ow
             wire.ask(session, &lane);
             let (session, qos) = (session.clone(), case.reader);
             let map = move |wire: &Wire| {
-                // A fork of it may keep the socket open, so its end is none.
+                // A fork of the process may keep the socket open, so the socket does not show its
+                // end.
                 let grant = if wire.is_empty() { None } else { wire.take_grant() }?;
                 wire.take_segments(&offer.peer);
                 let (peer, writer, ring) = (offer.peer, offer.writer, offer.ring);
@@ -211,7 +213,7 @@ fn join(case: &Case, wire: &Wire, session: &Arc<SessionSegment>) -> (End, Vec<Ow
     }
 }
 
-/// The survivor publishes.
+/// Prepares a survivor that publishes.
 fn serve(case: &Case, wire: &Wire, session: &Arc<SessionSegment>) -> (End, Vec<OwnedFd>) {
     let writer = writer(session, case.publisher);
     let seen = wire.serve(session, &writer, case.reader);
@@ -230,7 +232,7 @@ fn serve(case: &Case, wire: &Wire, session: &Arc<SessionSegment>) -> (End, Vec<O
     (End::Writer(Box::new(writer)), seen)
 }
 
-/// The next sample, which must be whole. Its sequence number.
+/// Takes the next sample, which must be whole, and returns its sequence number.
 fn check_next(case: &Case, reader: &mut Reader) -> Option<u64> {
     let mut out = Vec::new();
     let taken = reader.take(&mut out).expect("a sound ring")?;
@@ -240,7 +242,7 @@ fn check_next(case: &Case, reader: &mut Reader) -> Option<u64> {
     Some(sequence)
 }
 
-/// A sample that is kept must stay what it was.
+/// Checks that a pinned sample has not changed.
 fn check(case: &Case, sample: &Sample) {
     let mut bytes = Vec::new();
     sample.copy_to(&mut bytes).expect("memory");
@@ -249,7 +251,8 @@ fn check(case: &Case, sample: &Sample) {
     assert!(bytes == payload(sequence, case.len), "sample {sequence} is torn while it is pinned");
 }
 
-/// Takes all that is left, and counts. How many there were of the publisher in all, and the last.
+/// Takes and counts all remaining samples. Returns the publisher's total number of samples, and the
+/// last one.
 fn take_rest(case: &Case, reader: &mut Reader) -> (u64, Option<u64>) {
     assert!(reader.writer_dead(), "its pidfd says so");
     let first = reader.grant().first;
@@ -262,7 +265,8 @@ fn take_rest(case: &Case, reader: &mut Reader) -> (u64, Option<u64>) {
     (first + reader.received() + reader.lost() + reader.skipped(), last)
 }
 
-/// Takes all that the dead publisher left. Whether the operation's sample was there.
+/// Takes all samples that the dead publisher left. Returns whether the operation's sample was among
+/// them.
 fn drain(case: &Case, done: bool, mut reader: Reader) -> bool {
     let (counted, last) = take_rest(case, &mut reader);
     let shown = counted > case.before;
@@ -277,14 +281,14 @@ fn drain(case: &Case, done: bool, mut reader: Reader) -> bool {
     shown
 }
 
-/// Takes all that a publisher left which came to its end.
+/// Takes all samples of a publisher that finished.
 fn drain_all(case: &Case, mut reader: Reader, published: u64) {
     let (counted, last) = take_rest(case, &mut reader);
     assert_eq!(counted, published, "every sample is counted once");
     assert_eq!(last, Some(published - 1));
 }
 
-/// The publisher goes on from `sequence` without its dead reader.
+/// Lets the publisher continue from `sequence` without its dead reader.
 fn go_on(case: &Case, session: &Arc<SessionSegment>, writer: &Writer, sequence: u64) {
     let mut sequence = sequence;
     let mut publish = |count: u64| {
@@ -305,7 +309,7 @@ fn go_on(case: &Case, session: &Arc<SessionSegment>, writer: &Writer, sequence: 
     assert_eq!((reader.received(), reader.lost(), reader.skipped()), (1, 0, 0));
     drop(reader);
     assert_eq!(writer.drop_gone().len(), 1);
-    // What the dead one pinned has come back, too.
+    // The memory that the dead reader pinned is free again.
     let start = Instant::now();
     writer.reclaim_idle(start);
     assert!(
@@ -316,7 +320,7 @@ fn go_on(case: &Case, session: &Arc<SessionSegment>, writer: &Writer, sequence: 
     assert!(!session.segments().iter().any(samples));
 }
 
-/// The survivor's session still serves.
+/// Checks that the survivor's session still works.
 fn another_pair(session: &Arc<SessionSegment>) {
     let writer = writer(session, Qos::default());
     let mut reader = attach(session, &writer, Qos::default());
@@ -326,7 +330,7 @@ fn another_pair(session: &Arc<SessionSegment>) {
     assert_eq!(out, b"still here");
 }
 
-/// A reader in the survivor's own session.
+/// Attaches a reader in the survivor's own session.
 fn attach(session: &Arc<SessionSegment>, writer: &Writer, qos: Qos) -> Reader {
     let lane = session.allocate_lane().expect("a lane");
     let (reader, peer) = (Gid::new(session.id(), 2), RingPeer::Local(session.clone()));
@@ -344,7 +348,7 @@ fn attach(session: &Arc<SessionSegment>, writer: &Writer, qos: Qos) -> Reader {
     Reader::map(options).expect("a ring")
 }
 
-/// Bytes of memory that a session's segments have.
+/// Returns the bytes of memory of a session's segments.
 fn memory(session: &SessionSegment) -> u64 {
     let first = session.descriptors().expect("descriptors").segment;
     let bytes = |fd: BorrowedFd<'_>| fstat(fd).expect("a segment").st_blocks.cast_unsigned() * 512;
@@ -355,13 +359,13 @@ fn memory(session: &SessionSegment) -> u64 {
     bytes(first.as_fd()) + further.sum::<u64>()
 }
 
-/// What this process holds of the system's.
+/// The system resources that this process holds.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct Holdings {
     descriptors: usize,
-    /// Maps of memfds.
+    /// Number of maps of memfds.
     maps: usize,
-    /// Its share of shared memory, in KiB, where the system tells.
+    /// The process's share of shared memory in KiB, if the system tells.
     shared: Option<u64>,
     children: usize,
 }

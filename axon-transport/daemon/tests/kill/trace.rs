@@ -1,4 +1,4 @@
-//! A process that is stepped one instruction at a time and killed.
+//! A process that is single-stepped and killed.
 #![allow(unsafe_code)]
 
 use std::{
@@ -17,51 +17,51 @@ use nix::{
     unistd::{ForkResult, Pid, fork, setpgid},
 };
 
-/// The traced process; killed and reaped when dropped, with what it forked.
+/// The traced process. Dropping it kills and reaps the process and its forks.
 pub(crate) struct Tracee {
     pid: Pid,
     gone: bool,
     steps: u64,
-    /// The instruction at which the last [look](LOOK) found it, if that repeats itself.
+    /// The repeating instruction at which the last [look](LOOK) found the process, if any.
     repeats: Option<u64>,
 }
 
-/// So often it is looked whether the instruction is one that repeats itself.
+/// Number of steps between two checks whether the instruction is a repeating one.
 const LOOK: u64 = 256;
 
-/// What a step led to.
+/// The result of a step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Step {
-    /// The next instruction.
+    /// The process is at the next instruction.
     Next,
-    /// The operation's end.
+    /// The operation has ended.
     Done,
 }
 
-/// Marks, in the traced process, where the operation begins and where it ends.
+/// Marks the beginning and the end of the operation. Called in the traced process.
 pub(crate) fn mark() {
     raise(Signal::SIGSTOP).expect("a signal to oneself");
 }
 
 impl Tracee {
-    /// Runs `life` in a fork of this process, which must have one thread, up to its first
-    /// [`mark`]. `meanwhile` runs here until then: it plays the other end. Each gets one of `ends`,
-    /// and only that one, so that either sees when the other's is closed.
+    /// Runs `life` in a fork of this process up to its first [`mark`]; this process must have only
+    /// one thread. `meanwhile` runs here until then, for the other end. Each process gets only one
+    /// of `ends`, so that it sees when the other end is closed.
     pub(crate) fn start<E, T>(
         ends: (E, E),
         life: impl FnOnce(E),
         meanwhile: impl FnOnce(E) -> T,
     ) -> (Self, T) {
         let (ours, theirs) = ends;
-        // SAFETY: this process has one thread, so no lock is held by one that the child lacks.
+        // SAFETY: this process has one thread, so no thread that the child lacks holds a lock.
         match unsafe { fork() }.expect("a fork") {
             ForkResult::Child => {
                 drop(ours);
-                // What it forks is of the same group, which can be killed as a whole.
+                // Its forks are in the same process group, which can be killed as a whole.
                 let _ = setpgid(Pid::from_raw(0), Pid::from_raw(0));
                 let traced = ptrace::traceme().is_ok();
                 let well = traced && catch_unwind(AssertUnwindSafe(|| life(theirs))).is_ok();
-                // SAFETY: ends the process at once; nothing of the parent's may be dropped here.
+                // SAFETY: ends the process at once; nothing of the parent may be dropped here.
                 unsafe { libc::_exit(if well { 0 } else { 99 }) }
             }
             ForkResult::Parent { child } => {
@@ -78,10 +78,11 @@ impl Tracee {
         }
     }
 
-    /// Lets it execute one instruction, or one system call.
+    /// Lets the process execute one instruction or one system call.
     ///
-    /// An instruction that copies megabytes stops after each byte. Of such a one that two looks on
-    /// end found, which are 256 steps apart, the rest is one step.
+    /// A repeating instruction that copies megabytes stops after each byte. If two successive
+    /// checks, 256 steps apart, find the process at the same one, the rest of the instruction is
+    /// one step.
     pub(crate) fn step(&mut self) -> Step {
         self.steps += 1;
         if self.steps.is_multiple_of(LOOK) && self.finish_repeating() {
@@ -95,12 +96,12 @@ impl Tracee {
         }
     }
 
-    /// Whether it stood in the middle of an instruction that repeats itself, and has now done it to
-    /// its end.
+    /// Returns whether the process was in the middle of a repeating instruction, which it has now
+    /// finished.
     #[cfg(target_arch = "x86_64")]
     fn finish_repeating(&mut self) -> bool {
         let at = ptrace::getregs(self.pid).expect("a stopped tracee").rip;
-        // REP MOVS and REP STOS, with REX.W before the opcode or without.
+        // REP MOVS and REP STOS, with or without REX.W before the opcode.
         let len = match [0, 1, 2].map(|n| self.byte(at + n)) {
             [0xf2 | 0xf3, 0xa4 | 0xa5 | 0xaa | 0xab, _] => 2,
             [0xf2 | 0xf3, 0x48, 0xa4 | 0xa5 | 0xaa | 0xab] => 3,
@@ -117,19 +118,19 @@ impl Tracee {
         true
     }
 
-    /// Other architectures have none.
+    /// Other architectures have no such instructions.
     #[cfg(not(target_arch = "x86_64"))]
     fn finish_repeating(&mut self) -> bool {
         self.repeats = None;
         false
     }
 
-    /// Lets it run until it comes to the instruction at `end`.
+    /// Runs the process up to the instruction at `end`.
     #[cfg(target_arch = "x86_64")]
     fn run_to(&mut self, end: u64) {
         let (address, shift) = word_of(end);
         let word = ptrace::read(self.pid, address).expect("its code");
-        // INT3 stops it once it is executed.
+        // INT3 stops the process when it is executed.
         let stop = word & !(0xff << shift) | (0xcc << shift);
         ptrace::write(self.pid, address, stop).expect("its code");
         ptrace::cont(self.pid, None).expect("a stopped tracee");
@@ -142,19 +143,20 @@ impl Tracee {
         ptrace::setregs(self.pid, registers).expect("a stopped tracee");
     }
 
-    /// A byte of its code; that of no instruction beyond the end of what is mapped.
+    /// Returns a byte of the process's code; beyond the mapped memory a byte that begins no such
+    /// instruction.
     #[cfg(target_arch = "x86_64")]
     fn byte(&self, at: u64) -> u8 {
         let (address, shift) = word_of(at);
         ptrace::read(self.pid, address).map_or(0, |word| (word >> shift) as u8)
     }
 
-    /// Takes up to `count` steps. Whether the operation came to its end.
+    /// Takes up to `count` steps. Returns whether the operation ended.
     pub(crate) fn advance(&mut self, count: u64) -> bool {
         (0..count).any(|_| self.step() == Step::Done)
     }
 
-    /// Lets it run on to the operation's end.
+    /// Runs the process to the operation's end.
     pub(crate) fn advance_to_end(&mut self) {
         ptrace::cont(self.pid, None).expect("a stopped tracee");
         match waitpid(self.pid, None).expect("a child") {
@@ -163,18 +165,18 @@ impl Tracee {
         }
     }
 
-    /// Lets it go its own way from the operation's end.
+    /// Lets the process run freely from the operation's end.
     pub(crate) fn release(&mut self) {
         ptrace::detach(self.pid, None).expect("a stopped tracee");
     }
 
-    /// Waits until it has come to its own end, which must be a good one.
+    /// Waits until the process ends by itself, which must be without an error.
     pub(crate) fn finish(&mut self) {
         self.gone = true;
         assert_eq!(waitpid(self.pid, None), Ok(WaitStatus::Exited(self.pid, 0)));
     }
 
-    /// Kills it where it stands. What it forked lives on.
+    /// Kills the process where it is. Its forks live on.
     pub(crate) fn end(&mut self) {
         if !mem::replace(&mut self.gone, true) {
             let _ = kill(self.pid, Signal::SIGKILL);
@@ -189,23 +191,23 @@ impl Tracee {
 impl Drop for Tracee {
     fn drop(&mut self) {
         self.end();
-        // Its forks are this process's to reap, which is a subreaper.
+        // This process is a subreaper, so it has to reap the forks.
         if killpg(self.pid, Signal::SIGKILL).is_ok() {
             while waitpid(Pid::from_raw(-self.pid.as_raw()), None).is_ok() {}
         }
     }
 }
 
-/// The word that a byte of a tracee's is in, which no page's end divides, and where it is in it in
-/// bits.
+/// Returns the address of the aligned word that contains a byte of a traced process, and the bit
+/// offset of the byte. Such a word lies within one page.
 #[cfg(target_arch = "x86_64")]
 fn word_of(address: u64) -> (ptrace::AddressType, u64) {
     ((address & !7) as ptrace::AddressType, 8 * (address & 7))
 }
 
-/// Why no process can be traced here, if none can.
+/// Returns the reason if no process can be traced here.
 pub(crate) fn refused() -> Option<String> {
-    // SAFETY: as in `Tracee::start`; called before any thread is made.
+    // SAFETY: as in `Tracee::start`. Called before any thread is started.
     match unsafe { fork() } {
         Err(error) => Some(format!("no fork: {error}")),
         Ok(ForkResult::Child) => {

@@ -1,4 +1,4 @@
-//! What two sessions say to each other to share memory, over a socket pair instead of a daemon.
+//! The messages by which two sessions share memory, over a socket pair instead of a daemon.
 
 use std::{
     cell::RefCell,
@@ -28,20 +28,20 @@ use crate::operation::LARGEST;
 /// One end of the socket pair.
 pub(crate) struct Wire {
     socket: OwnedFd,
-    /// Segments that were handed over and not taken in yet.
+    /// Segments that were received and not mapped yet.
     pending: RefCell<Vec<(Vec<u8>, OwnedFd)>>,
 }
 
-/// A publisher as its reader's process knows it before it asks.
+/// The publisher's data, as its reader's process gets them before it asks.
 pub(crate) struct Offer {
     pub(crate) peer: Arc<PeerSession>,
     pub(crate) writer: Gid,
     pub(crate) ring: Location,
-    /// The publisher's segments once more, to be looked at from outside.
+    /// The descriptors of the publisher's segments, to read them from outside.
     pub(crate) seen: Vec<OwnedFd>,
 }
 
-/// A reader that may be mapped.
+/// A reader that can be mapped.
 pub(crate) struct Granted {
     pub(crate) peer: Arc<PeerSession>,
     options: ReaderOptions,
@@ -64,13 +64,13 @@ impl Wire {
         self.send(&[0], &[]);
     }
 
-    /// Waits for that word.
+    /// Waits for the word of [`go`](Self::go).
     pub(crate) fn wait(&self) {
         self.receive();
     }
 
-    /// The publisher's first word: its session and its ring. What segments it opens from then on
-    /// follow at once, as a daemon would pass them on.
+    /// Sends the publisher's first message: its session and its ring. Segments that it opens later
+    /// follow at once, as from a daemon.
     pub(crate) fn offer(&self, session: &SessionSegment, writer: &Writer) {
         self.introduce(session, writer.gid(), writer.location());
         let to = Self::of(self.socket.try_clone().expect("a descriptor"));
@@ -80,7 +80,7 @@ impl Wire {
             match event {
                 SegmentEvent::Opened(info, fd) => to.hand(info, fd),
                 SegmentEvent::Gone(info) => {
-                    // A process that is dead need not know.
+                    // A dead process does not need it.
                     let _ = to.try_send(&info.number.to_le_bytes(), &[]);
                 }
                 SegmentEvent::Low(_) => {}
@@ -93,12 +93,13 @@ impl Wire {
         Offer { peer, writer, ring, seen }
     }
 
-    /// The reader's answer: its session and the lane that it reads by.
+    /// Sends the reader's answer: its session and its lane.
     pub(crate) fn ask(&self, session: &SessionSegment, lane: &Lane) {
         self.introduce(session, Gid::new(session.id(), 1), lane.location());
     }
 
-    /// What the publisher attaches; with it the reader's segments, to be looked at from outside.
+    /// Receives the reader that the publisher attaches, and the reader's segments, to read them
+    /// from outside.
     pub(crate) fn take_request(&self, qos: Qos) -> (ReaderInfo, Vec<OwnedFd>) {
         let (peer, gid, lane, seen) = self.meet();
         let (peer, stands_for) = (RingPeer::Remote(peer), None);
@@ -117,12 +118,13 @@ impl Wire {
         Some(Grant { generation, first })
     }
 
-    /// Whether nothing is to be received: that of a dead process, a fork of which keeps the socket.
+    /// Returns whether nothing is left to receive from a dead process whose socket a fork keeps
+    /// open.
     pub(crate) fn is_empty(&self) -> bool {
         !self.is_ready()
     }
 
-    /// What a reader has counted.
+    /// Sends the counters of a reader.
     pub(crate) fn count(&self, counts: [u64; 4]) {
         self.send(counts.map(u64::to_le_bytes).as_flattened(), &[]);
     }
@@ -133,7 +135,7 @@ impl Wire {
         words.collect::<Vec<_>>().try_into().expect("four numbers")
     }
 
-    /// The publisher's half of an attachment, whole. The reader's segments.
+    /// Runs the publisher's side of an attachment. Returns the reader's segments.
     pub(crate) fn serve(
         &self,
         session: &SessionSegment,
@@ -146,7 +148,8 @@ impl Wire {
         segments
     }
 
-    /// The reader's half, but for the last step. The publisher's session and its segments.
+    /// Runs the reader's side of an attachment, except for the last step. Returns the grant and the
+    /// publisher's segments.
     pub(crate) fn join(&self, session: &Arc<SessionSegment>, qos: Qos) -> (Granted, Vec<OwnedFd>) {
         let Offer { peer, writer, ring, seen } = self.take_offer();
         let lane = session.allocate_lane().expect("a lane");
@@ -156,7 +159,7 @@ impl Wire {
         (Granted { peer, options }, seen)
     }
 
-    /// Hands a segment over.
+    /// Sends a segment.
     fn hand(&self, info: SegmentInfo, fd: BorrowedFd<'_>) {
         let publisher = match info.kind {
             SegmentKind::Samples(gid) => gid,
@@ -165,7 +168,7 @@ impl Wire {
         self.send(&[&info.number.to_le_bytes()[..], &publisher.0].concat(), &[fd]);
     }
 
-    /// Takes in the segments that were handed over, all that have come; their descriptors.
+    /// Maps all segments that have arrived, and returns their descriptors.
     pub(crate) fn take_segments(&self, peer: &PeerSession) -> Vec<OwnedFd> {
         while self.is_ready() {
             let (bytes, mut fds) = self.receive_any();
@@ -184,7 +187,7 @@ impl Wire {
         poll(&mut fds, Some(&Timespec::default())).is_ok_and(|ready| ready > 0)
     }
 
-    /// A session with its segments, and where something is in it.
+    /// Sends a session with its segments, and the location of an object in it.
     fn introduce(&self, session: &SessionSegment, gid: Gid, at: Location) {
         let descriptors = session.descriptors().expect("descriptors");
         let fds =
@@ -198,7 +201,8 @@ impl Wire {
         self.go();
     }
 
-    /// A session, what it named and where, and its segments once more.
+    /// Receives a session: its view, the GID and the location of the object, and the descriptors of
+    /// its segments.
     fn meet(&self) -> (Arc<PeerSession>, Gid, Location, Vec<OwnedFd>) {
         let (bytes, fds) = self.receive();
         let (ids, place) = bytes.split_at(32);
@@ -234,7 +238,7 @@ impl Wire {
         sendmsg(&self.socket, &[IoSlice::new(bytes)], &mut control, flags)
     }
 
-    /// The next packet that is not a segment.
+    /// Receives the next packet that is not a segment.
     fn receive(&self) -> (Vec<u8>, Vec<OwnedFd>) {
         loop {
             let (bytes, mut fds) = self.receive_any();
@@ -266,7 +270,7 @@ impl Wire {
     }
 }
 
-/// Maps a segment that was handed over.
+/// Maps a segment that was received.
 fn take_in(peer: &PeerSession, bytes: &[u8], fd: OwnedFd) -> OwnedFd {
     let (number, publisher) = bytes.split_at(4);
     let number = u32::from_le_bytes(number.try_into().expect("a number"));
@@ -277,7 +281,7 @@ fn take_in(peer: &PeerSession, bytes: &[u8], fd: OwnedFd) -> OwnedFd {
     fd
 }
 
-/// What it takes to map a reader of `writer`.
+/// Returns the options to map a reader of `writer`.
 pub(crate) fn options(
     session: &SessionSegment,
     peer: Arc<PeerSession>,

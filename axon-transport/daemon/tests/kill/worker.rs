@@ -1,4 +1,4 @@
-//! A process of one thread that sets scenes, kills, and reports.
+//! A process with one thread that prepares scenes, kills, and reports.
 
 use std::{
     collections::BTreeSet,
@@ -21,33 +21,34 @@ use crate::{
     survivor::{Holdings, Outcome, Scene},
 };
 
-/// Kills that a bounded run makes in all, if there are so many instructions.
+/// Number of kills of a bounded run in total, if there are enough instructions.
 const BOUNDED: usize = 1000;
-/// Where a long operation is killed in a bounded run.
+/// The instructions at which a bounded run kills a long operation.
 const BLIND: [u64; 8] = [0, 100, 1000, 5000, 10_000, 20_000, 40_000, u64::MAX];
-/// Steps that a full run takes, unless it is told otherwise, to kill an operation at each of its
-/// instructions, or at each so many of a long one; about as many again go into its states.
+/// Default number of steps in which a full run kills an operation at each of its instructions, or
+/// at every nth instruction of a long one. The states take about as many steps again.
 pub(crate) const STEPS: u64 = 2_000_000;
-/// States of a long operation around which a full run kills it, and half as many are the last ones.
+/// Number of states of a long operation around which a full run kills it. The last states add half
+/// as many.
 const STATES: u64 = 100;
-/// So many at least, however long it is.
+/// Lower limit of that number, however long the operation is.
 const FEW_STATES: u64 = 8;
-/// A process that takes longer for [so many steps](STRIDE), to set a scene or to get over a death,
-/// is wedged; in seconds.
+/// Seconds after which a process is stuck: the limit for [this many steps](STRIDE), for the
+/// preparation of a scene, and for the survivor after a death.
 const PATIENCE: u32 = 60;
 const STRIDE: u64 = 1000;
-/// An operation of more instructions goes round in circles.
+/// An operation with more instructions is in an endless loop.
 const ENDLESS: u64 = 20_000_000;
 
-/// What a worker is to do.
+/// The task of a worker.
 pub(crate) struct Plan {
-    /// Those of a full run; `None` for a bounded one.
+    /// The number of steps of a full run; `None` for a bounded run.
     pub(crate) steps: Option<u64>,
     pub(crate) cases: Vec<usize>,
 }
 
 pub(crate) fn run(plan: &Plan) {
-    // What a doomed process forked is this one's to reap.
+    // This process has to reap the forks of a doomed process.
     prctl::set_child_subreaper(true).expect("a subreaper");
     let _tidy = Tidy;
     let all = cases();
@@ -62,7 +63,8 @@ pub(crate) fn run(plan: &Plan) {
             continue;
         }
         say(&format!("\"{}\", walking", case.name));
-        // A long one is killed at some points all the same; the states are for the full run.
+        // A long operation is killed at some points all the same; only the full run looks for its
+        // states.
         let (instructions, states) =
             if case.long && plan.steps.is_none() { Default::default() } else { walk(case) };
         let points = match instructions {
@@ -93,7 +95,7 @@ pub(crate) fn run(plan: &Plan) {
     }
 }
 
-/// Kills after `point` instructions.
+/// Kills the process after `point` instructions.
 fn at(case: &Case, point: u64) -> Outcome {
     alarm::set(PATIENCE);
     let before = Holdings::now();
@@ -118,7 +120,8 @@ fn advance(scene: &mut Scene<'_>, count: u64) {
     alarm::set(PATIENCE);
 }
 
-/// Steps through the operation: its instructions, and those after which a segment had changed.
+/// Steps through the operation. Returns the number of its instructions, and the numbers of those
+/// that changed a segment.
 fn walk(case: &Case) -> (u64, Vec<u64>) {
     alarm::set(PATIENCE);
     let mut scene = Scene::set(case);
@@ -142,7 +145,8 @@ fn walk(case: &Case) -> (u64, Vec<u64>) {
     (steps, states)
 }
 
-/// What memory backs the segments with. Read without mapping: that would back their holes.
+/// Returns the parts of the segments that are backed by memory. Reads without mapping, which would
+/// back the holes.
 fn contents(segments: &[OwnedFd]) -> Vec<(u64, Vec<u8>)> {
     let mut extents = Vec::new();
     for segment in segments {
@@ -159,17 +163,18 @@ fn contents(segments: &[OwnedFd]) -> Vec<(u64, Vec<u8>)> {
     extents
 }
 
-/// The instructions after which to kill, in order.
+/// Returns the numbers of the instructions after which to kill, in ascending order.
 fn points(steps: Option<u64>, instructions: u64, states: &[u64], share: usize) -> Vec<u64> {
     let mut points = BTreeSet::from([0, instructions]);
-    // The end may come later in another run: addresses and the allocator's state differ.
+    // The end may come later in another run, because addresses and the allocator's state differ.
     points.insert(2 * instructions + 10_000);
     let around = |state: &u64| [state - 1, *state];
     if let Some(steps) = steps {
-        // To come to an instruction takes all those before it: of many, only each so many.
+        // Each run has to execute all instructions before the kill, so of many instructions only
+        // every nth is chosen.
         let every = (instructions * instructions).div_ceil(2 * steps).max(1);
         points.extend((0..=instructions).step_by(usize::try_from(every).expect("a step")));
-        // Most of many states are words of a payload that nobody sees yet.
+        // If there are many states, most of them are words of a payload that no reader sees yet.
         let share = (steps / instructions).clamp(FEW_STATES, STATES);
         let share = usize::try_from(share).expect("a number of states");
         let many = states.len().div_ceil(share);
@@ -185,7 +190,7 @@ fn points(steps: Option<u64>, instructions: u64, states: &[u64], share: usize) -
     if 2 * states.len() < share {
         points.extend(states.iter().flat_map(around));
     } else {
-        // The last of many publish what the others prepared.
+        // If there are many states, the last ones publish what the others prepared.
         points.extend(states[states.len() - share / 4..].iter().flat_map(around));
     }
     let share = share.min(usize::try_from(instructions / 2).unwrap_or(share));

@@ -1,4 +1,4 @@
-//! What the children of the tests do.
+//! The code of the children of the tests.
 
 use std::{fs, os::unix::process::CommandExt as _, path::Path, process::Command, time::Duration};
 
@@ -19,7 +19,7 @@ use crate::{
     support::{PATIENCE, of_child, say, until, wait_for_the_end},
 };
 
-/// A session, or why there is none.
+/// Opens a session, or returns the error.
 fn try_session() -> Result<Session, SessionError> {
     let config = Config::from_env().unwrap();
     Session::open(&config, SessionOptions::new("player"))
@@ -30,7 +30,7 @@ pub(crate) fn play(part: &str) {
     match part {
         "elevated" => crate::elevated::play(),
         "locked" => {
-            // SAFETY: takes plain flags.
+            // SAFETY: the call takes only flags.
             if unsafe { libc::mlockall(libc::MCL_CURRENT | libc::MCL_FUTURE) } != 0 {
                 return say(format!("cannot lock: {}", std::io::Error::last_os_error()));
             }
@@ -46,7 +46,7 @@ pub(crate) fn play(part: &str) {
             say("taken");
             wait_for_the_end();
         }
-        // Alone in its process, so that all shared memory is its own.
+        // Runs alone in its process, so that all shared memory there is its own.
         "owner" => {
             let context = Context::new().unwrap();
             let options = PublisherOptions::new(Qos::keep_all()).budget(512 << 20);
@@ -69,7 +69,8 @@ pub(crate) fn play(part: &str) {
             setrlimit(Resource::Nofile, few).unwrap();
             let context = Context::new().unwrap();
             let mut subscribers = Vec::new();
-            // The last socket stays open: a process that has not met it yet would wait in vain.
+            // The last socket stays open: the other process may still be connecting, and would wait
+            // in vain.
             let (_socket, error) = loop {
                 let socket = meet(&format!("{}-{}", place(), subscribers.len()), false);
                 let options = SubscriberOptions::new(Qos::keep_all());
@@ -80,7 +81,7 @@ pub(crate) fn play(part: &str) {
                 say("attached");
             };
             say(error);
-            // What is attached goes on.
+            // The attached subscribers go on.
             for mut subscriber in subscribers {
                 assert!(subscriber.recv(Some(PATIENCE)).unwrap().is_some());
             }
@@ -111,7 +112,7 @@ pub(crate) fn play(part: &str) {
             let few = Rlimit { current: Some(256), maximum: Some(256) };
             setrlimit(Resource::Nofile, few).unwrap();
             let session = of_child("many");
-            // A publisher takes a descriptor with its first large sample.
+            // A publisher opens a descriptor with its first large sample.
             let mut publishers = Vec::new();
             let error = loop {
                 let topic = format!("/t{}", publishers.len());
@@ -122,7 +123,7 @@ pub(crate) fn play(part: &str) {
                 }
             };
             say(error);
-            // What is small needs none.
+            // A publisher of small samples opens no descriptor.
             let small = session.create_publisher(latched("/small")).unwrap();
             small.publish(b"small").unwrap();
             publishers.truncate(50);
@@ -149,7 +150,7 @@ pub(crate) fn play(part: &str) {
             say("published");
             let mut line = String::new();
             std::io::stdin().read_line(&mut line).unwrap();
-            // What is small needs no memory of its own.
+            // Small samples need no separate memory.
             all[0].publish(b"small").unwrap();
             wait_for_the_end();
         }
@@ -162,7 +163,7 @@ pub(crate) fn play(part: &str) {
             );
             let options = options.budget(1 << 30).max_len(128 << 20);
             let publisher = Publisher::new(&context, options).unwrap();
-            // Fewer samples of this size are kept than are wanted.
+            // The memory holds fewer samples of this size than the depth.
             let sample = vec![1; 4 << 20];
             for _ in 0..100 {
                 publisher.publish(&sample).unwrap();
@@ -262,7 +263,7 @@ pub(crate) fn play(part: &str) {
             setrlimit(Resource::Nofile, few).unwrap();
             let open = || fs::File::open("/dev/null").ok();
             let mut all: Vec<_> = std::iter::from_fn(open).collect();
-            // Short of each of those that a session opens, in turn.
+            // Each descriptor that a session opens is in turn the one that fails.
             loop {
                 match try_session() {
                     Ok(session) => {

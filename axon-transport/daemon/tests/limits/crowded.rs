@@ -1,5 +1,5 @@
-//! A daemon with no descriptors left for another session: the session is told why and what to set, those that there
-//! are go on, and nobody takes the others' share.
+//! A daemon without descriptors for another session: the refused session is told why and what to set, existing sessions
+//! go on, and no process takes the share of others.
 
 use axon_transport::{
     ids::SessionId,
@@ -21,7 +21,8 @@ fn limit(daemon: &Kept, files: u64) {
     prlimit(Some(Pid::from_child(&daemon.0)), Resource::Nofile, limit).unwrap();
 }
 
-/// Starts processes with one session each until one is refused: those that are served, and what the last one was told.
+/// Starts processes with one session each until one is refused. Returns the processes that are served, and the error
+/// that the last one got.
 fn crowd(host: &Host, most: usize) -> (Vec<Player>, String) {
     let mut served = Vec::new();
     loop {
@@ -39,7 +40,7 @@ fn host() -> Host {
     Host::new().with("AXON_DAEMON", "require")
 }
 
-/// What a refused session has to know.
+/// Checks that a refused session is told what it has to know.
 fn is_told(said: &str, limit: u64) {
     for part in [&*format!("of its {limit} "), "RLIMIT_NOFILE", "ulimit -n", "LimitNOFILE"] {
         assert!(said.contains(part), "{said} lacks {part:?}");
@@ -53,7 +54,7 @@ fn session_beyond_the_descriptor_limit_is_told_the_numbers_and_the_setting() {
     limit(&daemon, 256);
     let (mut served, said) = crowd(&host, 64);
     is_told(&said, 256);
-    // Of 256 descriptors a session takes four; the gateway needs none for it.
+    // Of 256 descriptors, a session takes four; the gateway needs none for it.
     assert!(served.len() >= 32, "{} sessions are served", served.len());
 
     let status = host.status().expect("a tool is served");
@@ -65,7 +66,7 @@ fn session_beyond_the_descriptor_limit_is_told_the_numbers_and_the_setting() {
     let log = std::fs::read_to_string(host.log()).unwrap();
     assert!(log.contains("LimitNOFILE"), "the log says it as well");
 
-    // Those that there are see each other, and one that ends makes room.
+    // The served sessions see each other, and one that ends makes room.
     served[0].go();
     assert_eq!(served[0].hear(), "everybody is there");
     served.pop().unwrap().finish();
@@ -84,7 +85,7 @@ fn daemon_takes_as_many_descriptors_as_its_hard_limit_allows() {
     let _daemon = host.daemon_by(shell);
     let descriptors = host.status().expect("a tool is served").descriptors;
     assert_eq!(descriptors.expect("they are counted").limit, Some(512));
-    // Four descriptors a session: the sixty-four that were set would not do for these.
+    // A session takes four descriptors, so the soft limit of 64 would not suffice for these.
     let _served: Vec<Player> = (0..24)
         .map(|_| {
             let mut player = host.play("one session");
@@ -94,7 +95,7 @@ fn daemon_takes_as_many_descriptors_as_its_hard_limit_allows() {
         .collect();
 }
 
-/// The daemon's words in an error of the session.
+/// Returns the daemon's words in an error of the session.
 fn said_here(said: &str) -> &str {
     said.split_once("refuses the session: ").expect("refused").1
 }
@@ -110,7 +111,7 @@ fn process_with_many_sessions_leaves_the_others_their_share() {
     assert!(said.contains("its process"), "{said}");
     let mut others = [(); 5].map(|()| host.play("one session"));
     others.iter_mut().for_each(|player| assert_eq!(player.hear(), "served"));
-    // Another that wants all takes less, and still there is room for somebody.
+    // Another process that wants everything gets less, and a third one is still served.
     let mut second = host.play("many sessions");
     assert!(second.hear().contains("its process"));
     assert_eq!(host.play("one session").hear(), "served");
@@ -131,7 +132,7 @@ fn limit_below_open_descriptors_refuses_new_sessions_and_keeps_existing_sessions
     }
     let status = host.status().expect("a tool is served");
     assert_eq!(status.descriptors.expect("counted").limit, Some(30));
-    // What needs no descriptor of the daemon goes on.
+    // Operations that need no descriptor of the daemon go on.
     let subscription = here.create_subscription(spec("/crowd")).unwrap();
     first.go();
     assert_eq!(first.hear(), "everybody is there");
@@ -144,7 +145,8 @@ fn limit_below_open_descriptors_refuses_new_sessions_and_keeps_existing_sessions
     first.finish();
 }
 
-/// Who is refused sends descriptors that are slow to close. What is kept for callers stays free.
+/// A refused caller sends descriptors that are slow to close. The descriptors that the daemon reserves for callers stay
+/// free.
 #[test]
 fn descriptors_of_callers_that_are_refused_are_not_received() {
     let host = host();
@@ -164,11 +166,11 @@ fn descriptors_of_callers_that_are_refused_are_not_received() {
     });
     let (hello, unknown) = (hello.encode().unwrap(), [200, 0xa0]);
     let mut kept = Vec::new();
-    // It receives nothing before all is sent: else the last close may be this thread's.
+    // The daemon receives nothing before everything has been sent; otherwise the last close could be this thread's.
     signal(daemon.0.id(), Signal::STOP);
     let pid = Pid::from_child(&daemon.0);
     waitid(WaitId::Pid(pid), WaitIdOptions::STOPPED).unwrap();
-    // More than the daemon has threads that close, and more than it keeps for callers.
+    // More than the daemon has closing threads, and more than it reserves for callers.
     for packet in [&hello[..], &unknown].into_iter().cycle().take(100) {
         let Ok(stranger) = Address::of(&host.config()).connect() else { continue };
         let (fd, peer) = hiding();
@@ -177,7 +179,7 @@ fn descriptors_of_callers_that_are_refused_are_not_received() {
     }
     signal(daemon.0.id(), Signal::CONT);
     let served_last = served.pop().unwrap();
-    // Those that are served go on meanwhile; who comes has to wait, as closings block.
+    // The served sessions go on meanwhile. A new one has to wait, because closes block.
     served[0].go();
     assert_eq!(served[0].hear(), "everybody is there");
     let open = || std::fs::read_dir(format!("/proc/{}/fd", daemon.0.id())).unwrap().count();

@@ -1,4 +1,4 @@
-//! Programs that run with more rights than their callers: what these put into the environment is neither
+//! Programs that run with more rights than their callers: files that the caller's environment names are neither
 //! executed nor read.
 
 use std::{
@@ -14,9 +14,9 @@ use crate::{skip::skip, support::say};
 
 const NOBODY: u32 = 65534;
 
-/// The child: says what the kernel says of it, and what comes of its environment.
+/// The child: reports AT_SECURE, and the effects of its environment.
 pub(crate) fn play() {
-    // SAFETY: looks a number up.
+    // SAFETY: the call only looks up a number.
     say(format!("AT_SECURE {}", unsafe { libc::getauxval(libc::AT_SECURE) }));
     match Config::from_env() {
         Err(error) => say(format!("refused {error}")),
@@ -27,13 +27,13 @@ pub(crate) fn play() {
     }
 }
 
-/// A copy of this program, and what its caller has prepared for it.
+/// A copy of this program, and the files that its caller has prepared for it.
 struct Trap {
     dir: PathBuf,
 }
 
 impl Trap {
-    /// `None` where this process cannot be two users.
+    /// Creates the trap; `None` if this process cannot act as two users.
     fn new(name: &str) -> Option<Self> {
         if !rustix::process::geteuid().is_root() {
             skip("only root can be two users");
@@ -66,7 +66,7 @@ impl Trap {
         self.path("program")
     }
 
-    /// What the program says when nobody runs it with this variable.
+    /// Returns the output of the program when the user nobody runs it with this variable.
     fn run(&self, program: &Path, name: &str, value: &Path) -> String {
         let output = Command::new(program)
             .args(["child", "--exact", "--nocapture", "--test-threads=1"])
@@ -87,7 +87,7 @@ impl Trap {
         fs::remove_file(self.path("open/executed")).is_ok()
     }
 
-    /// With the caller's own rights the variables work: the trap is one.
+    /// Checks that the variables work with the caller's own rights, so that the trap is a real one.
     fn works(&self) {
         let said = self.run(&self.program(), "AXON_DAEMON_PATH", &self.path("daemon"));
         assert!(said.contains("AT_SECURE 0"), "{said}");
@@ -100,12 +100,12 @@ impl Trap {
         }
     }
 
-    /// Variables that say where programs are, in whatever program.
+    /// Variables that name folders of programs, in any program.
     fn folders(&self) -> [(&'static str, PathBuf); 2] {
         [("PATH", self.path("bin")), ("CARGO_HOME", self.dir.clone())]
     }
 
-    /// With others' rights they do not; whether the kernel gives them here.
+    /// Checks that they do not work with the rights of others. Returns whether the kernel gives such rights here.
     fn holds(&self) -> bool {
         let file = self.path("axon.toml.of_caller");
         let said = self.run(&self.program(), "AXON_DAEMON_PATH", &self.path("daemon"));
@@ -137,7 +137,7 @@ impl Trap {
             assert!(said.contains("not opened"), "{name}: {said}");
         }
         assert!(!self.was_executed());
-        // Not an error, and not used: there is no daemon beside the program.
+        // The variable is not an error but ignored: there is no daemon beside the program.
         let said = self.run(&self.program(), "XDG_RUNTIME_DIR", &self.path("open"));
         assert!(said.contains("not opened"), "{said}");
         assert_eq!(fs::read_dir(self.path("open")).unwrap().count(), 0, "{said}");
@@ -151,8 +151,8 @@ impl Drop for Trap {
     }
 }
 
-/// Copies a program by another process. If this one wrote it, a child that another test forks meanwhile would have it open
-/// for writing, and executing it would fail (ETXTBSY).
+/// Copies a program through another process. If this process wrote it, a child that another test forks meanwhile would
+/// have it open for writing, and executing it would fail (ETXTBSY).
 fn copy(from: &Path, to: &Path) {
     assert!(Command::new("cp").args([from, to]).status().unwrap().success());
 }
@@ -169,7 +169,7 @@ fn a_set_uid_program_takes_no_paths_from_its_callers_environment() {
     if !trap.holds() {
         return skip("set-uid programs get no rights on /tmp (nosuid)");
     }
-    // The caller makes the program stand beside what is theirs: a hard link does that.
+    // The caller places the program beside its own files by a hard link.
     let linked = trap.path("open/program");
     fs::hard_link(trap.program(), &linked).unwrap();
     for name in ["axon_daemon", "axon.toml"] {

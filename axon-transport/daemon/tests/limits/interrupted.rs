@@ -1,4 +1,4 @@
-//! Stopped or killed in the middle of an attachment.
+//! Processes that are stopped or killed in the middle of an attachment.
 
 use std::{thread, time::Duration};
 
@@ -25,11 +25,11 @@ fn a_reader_stopped_during_its_attachment_blocks_no_other_reader() {
         let mut reader = host.play("listener");
         thread::sleep(Duration::from_millis(round * 2));
         signal(reader.pid(), Signal::STOP);
-        // Whatever it has come to, the others go on.
+        // The other processes go on, whatever point it has reached.
         for _ in 0..5 {
             match publisher.publish(b"x") {
                 Ok(_) => published += 1,
-                // It is attached already, and this is what KEEP_ALL means.
+                // The stopped subscriber is attached already, and KEEP_ALL waits for it.
                 Err(PublishError::Blocked { .. }) => {}
                 Err(error) => panic!("{error}"),
             }
@@ -57,7 +57,7 @@ fn a_reader_stopped_during_its_attachment_blocks_no_other_reader() {
 #[test]
 fn successor_completes_the_attachments_of_a_killed_daemon() {
     let host = Host::new();
-    // The first of them starts the daemon, and so do those that follow.
+    // The first process starts the daemon, and so does each that follows.
     let mut idle = host.play("listener");
     until("a daemon is there", || host.status().is_ok());
     for round in 0..12 {
@@ -80,7 +80,7 @@ fn successor_completes_the_attachments_of_a_killed_daemon() {
     idle.finish();
 }
 
-/// A session in this process with a daemon that somebody else starts.
+/// Opens a session in this process, with a daemon that another process starts.
 fn host_session(host: &Host, name: &str) -> Session {
     let mut session = None;
     until("a daemon takes it", || {

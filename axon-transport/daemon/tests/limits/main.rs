@@ -1,5 +1,5 @@
-//! At the limits that a system sets, and interrupted where it hurts: an error that says what is
-//! short, or a delay, and never somebody's end.
+//! Limits of the system, and interruptions at critical points: the result is an error that names
+//! what is short, or a delay. No other process fails.
 
 mod child;
 mod crowded;
@@ -38,25 +38,25 @@ fn spec(topic: &str) -> EndpointSpec {
     EndpointSpec::new(topic, "test/Bytes", Qos::keep_all())
 }
 
-/// What is published before anybody listens is kept.
+/// Keeps samples that are published before a subscription joins.
 fn latched(topic: &str) -> EndpointSpec {
     let qos = Qos::keep_all().with_durability(Durability::TransientLocal);
     EndpointSpec::new(topic, "test/Bytes", qos)
 }
 
-/// Of samples that are read in place, the newest are kept for readers that come later.
+/// Keeps the newest samples that are read in place for late joiners.
 fn image() -> EndpointSpec {
     let qos = Qos::default().with_durability(Durability::TransientLocal);
     EndpointSpec::new("/image", "test/Bytes", qos)
 }
 
-/// What the descriptors of a process are of.
+/// Lists the targets of a process's descriptors.
 fn descriptors(process: &str) -> String {
     let entries = fs::read_dir(format!("/proc/{process}/fd")).unwrap();
     let links = entries.filter_map(|entry| {
         let number = entry.ok()?.path();
         let to = fs::read_link(&number).ok()?;
-        // Not the one by which this is read.
+        // Not the descriptor that reads this directory.
         let other = !to.starts_with("/proc");
         other.then(|| format!("{} {}", number.file_name().unwrap().display(), to.display()))
     });
@@ -65,7 +65,7 @@ fn descriptors(process: &str) -> String {
     links.join(", ")
 }
 
-/// One end of a socket between a test and its child; `first` is the test's.
+/// Creates one end of a socket between a test and its child; `first` is the test's.
 fn meet(name: &str, first: bool) -> UnixDatagram {
     let path = |end: bool| PathBuf::from(format!("{name}.{}", u8::from(end)));
     let socket = UnixDatagram::bind(path(first)).unwrap();
@@ -77,7 +77,7 @@ fn at(host: &Host, name: &str) -> String {
     host.dir.path().join(name).to_str().unwrap().to_owned()
 }
 
-/// What the children of the tests do. In a run of the tests themselves it does nothing.
+/// The code of the children of the tests. It does nothing in a run of the tests themselves.
 #[test]
 fn child() {
     if let Ok(part) = std::env::var("PLAY") {
@@ -85,7 +85,7 @@ fn child() {
     }
 }
 
-/// Blocks of shared memory that this process holds descriptors of.
+/// Returns the number of blocks of shared memory to which this process has descriptors.
 fn blocks() -> u64 {
     let paths = fs::read_dir("/proc/self/fd").unwrap().flatten().map(|entry| entry.path());
     let is_ours = |to: &Path| to.as_os_str().as_encoded_bytes().starts_with(b"/memfd:axon-");
@@ -124,7 +124,8 @@ fn a_process_without_descriptors_left_says_so_and_goes_on() {
     let mut reader = host.play("few descriptors");
     let mut publishers = Vec::new();
     let said = loop {
-        // Each of a context of its own: what makes a peer take descriptors.
+        // Each publisher has its own context, because a context is what makes a peer take
+        // descriptors.
         let context = Context::new().unwrap();
         let options = PublisherOptions::new(Qos::keep_all());
         let publisher = Publisher::new(&context, options).unwrap();
@@ -187,7 +188,7 @@ fn session_with_too_much_memory_is_told_once_and_stays() {
     much.go();
     assert!(first.recv(&mut bytes, Some(PATIENCE)).is_ok());
     assert_eq!((&bytes[..], told("RLIMIT_NOFILE")), (&b"small"[..], 1));
-    // It was never disconnected.
+    // The session was never disconnected.
     much.finish_silently();
 }
 
@@ -239,7 +240,7 @@ fn exec_releases_all_but_the_read_samples() {
         at
     };
     let held = publish();
-    // So many that a place comes again unless it is held.
+    // So many samples that each location is used again unless it is held.
     let comes_again = || (0..100).any(|_| publish() == held);
     let mut former = host.play("successor");
     let before = former.hear();
@@ -265,12 +266,12 @@ fn another_user_is_not_heard() {
     if !rustix::process::geteuid().is_root() {
         return skip("only root can be two users");
     }
-    // The abstract name is the user's and the domain's: a domain that no other test has.
+    // The abstract name is unique per user and domain, so the test uses a domain of its own.
     let host = Host::new().without("AXON_RUNTIME_DIR").with("ROS_DOMAIN_ID", "171");
     let _daemon = host.daemon();
     let name = Address::of(&host.config()).to_string();
     let name = name.strip_prefix('@').expect("an abstract name");
-    // Where another user can run it.
+    // In a folder from which another user can run it.
     let program = Path::new("/tmp").join(format!("axon-limits-{}", std::process::id()));
     fs::copy(std::env::current_exe().unwrap(), &program).unwrap();
     let output = host
@@ -291,7 +292,7 @@ fn another_user_is_not_heard() {
 #[test]
 fn a_forked_child_can_have_a_context_of_its_own() {
     let context = Context::new().unwrap();
-    // SAFETY: the child makes and drops a context, and leaves by _exit.
+    // SAFETY: the child only creates and drops a context, and leaves by _exit.
     let child = unsafe { libc::fork() };
     if child == 0 {
         let refused = matches!(context.event(), Err(ShmError::Forked));

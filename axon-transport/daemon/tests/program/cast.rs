@@ -1,4 +1,4 @@
-//! What each process of a program does: what its test tells it, line by line.
+//! The code of the processes of a program: each follows the orders of its test, line by line.
 
 use std::{
     collections::{BTreeSet, HashMap},
@@ -24,7 +24,7 @@ use super::{
     watch::Watch,
 };
 
-/// The nodes and endpoints of a process, by the numbers that its test gives them.
+/// The nodes and endpoints of a process, by the numbers that its test assigns.
 struct Cast {
     session: Session,
     nodes: HashMap<u64, Node>,
@@ -98,7 +98,7 @@ impl Cast {
         }
         let qos = profile.qos();
         let spec = EndpointSpec::new(topic, type_name, qos).type_hash(hash);
-        // A node's endpoints have its name whatever they are told.
+        // The endpoints of a node have its name, whatever they are told.
         let (session, node) = (&self.session, by.map(|by| &self.nodes[&by]));
         macro_rules! make {
             ($create:ident) => {
@@ -159,7 +159,7 @@ impl Cast {
         Published { first, count, blocked: false }
     }
 
-    /// Takes until nothing more of what is owed can come: it was taken, or is counted as lost or too old.
+    /// Takes samples until no more of the `owed` ones can come: each was taken, or counts as lost or expired.
     fn take(&self, id: u64, owed: u64) -> Taken {
         let (subscription, watch) = &self.subscriptions[&id];
         let mut samples = Vec::new();
@@ -183,7 +183,7 @@ impl Cast {
             }
             let more = [Waitable::Subscription(subscription)];
             if self.session.wait_for(&more, Some(PATIENCE)).unwrap().is_empty() {
-                // What the test hears of is too few.
+                // The test then sees too few samples.
                 break;
             }
         }
@@ -191,7 +191,7 @@ impl Cast {
         Taken { samples, losses: losses(watch), lost, expired }
     }
 
-    /// Answers so many requests by what they say, and finds no more.
+    /// Answers `count` requests by their content, and checks that there are no more.
     fn answer(&self, id: u64, count: u64) -> BTreeSet<Call> {
         let server = &self.servers[&id];
         let mut bytes = Vec::new();
@@ -205,7 +205,7 @@ impl Cast {
         taken
     }
 
-    /// Takes so many responses, and finds no more.
+    /// Takes `count` responses, and checks that there are no more.
     fn hear(&self, id: u64, count: u64) -> BTreeSet<Call> {
         let client = &self.clients[&id];
         let mut bytes = Vec::new();
@@ -218,7 +218,7 @@ impl Cast {
         taken
     }
 
-    /// What a wait for everything finds.
+    /// Returns the endpoints that a wait for everything finds ready.
     fn ready(&self, some: bool) -> BTreeSet<u64> {
         let subscriptions =
             self.subscriptions.iter().map(|(id, (s, _))| (*id, Waitable::Subscription(s)));
@@ -252,7 +252,7 @@ impl Cast {
 }
 
 fn losses(watch: &Watch) -> Losses {
-    // Looking finds what nobody has taken yet.
+    // Querying the event finds losses before any sample is taken.
     watch.lost().is_ready();
     let EventStatus::Counted(status) = watch.lost().take() else { unreachable!() };
     Losses { total: status.total, change: status.change }
@@ -287,7 +287,7 @@ fn described(endpoint: &Endpoint) -> Described {
     }
 }
 
-/// Who said what.
+/// Returns the sender of a request or response, and its number.
 fn said(who: &Gid, bytes: &[u8]) -> Call {
     let (stamp, rest) = bytes.split_first_chunk().unwrap();
     let stamp = u64::from_le_bytes(*stamp);

@@ -1,12 +1,18 @@
-//! Random programs over several processes against a reference model: every node and endpoint in every
-//! process's graph, field by field; who is matched with whom and why others are not, by ROS 2's rules;
-//! what each endpoint's statuses say; which samples a subscription takes, in which order and under which
-//! numbers, which of the rest are lost, too old or passed over, and what its event counts of them; whom a
-//! publisher waits for; which requests a server gets and which responses a client; and what a wait finds
-//! ready. Nodes and endpoints come and go, processes are killed, and so is the daemon.
+//! Runs random programs over several processes and compares them with a reference model. Compared are:
 //!
-//! A bounded sample of them; more: `PROGRAMS=200 cargo test -p axon-daemon --test program`. One that
-//! failed says its seed, and `PROGRAM_SEED=...` repeats it alone.
+//! - every node and endpoint in every process's graph, field by field;
+//! - the matches, and the reasons for mismatches, by ROS 2's rules;
+//! - the statuses of each endpoint;
+//! - the samples that a subscription takes, their order and numbers; the samples that are lost, expired or skipped, and
+//!   the losses that its event counts;
+//! - the readers for which a publisher waits;
+//! - the requests of each server, and the responses of each client;
+//! - the results of a wait.
+//!
+//! Nodes and endpoints come and go, processes are killed, and so is the daemon.
+//!
+//! An ordinary run executes a bounded number of programs; for more: `PROGRAMS=200 cargo test -p axon-daemon --test
+//! program`. A failed program prints its seed, and `PROGRAM_SEED=...` repeats it alone.
 
 mod cast;
 mod model;
@@ -25,10 +31,10 @@ use std::collections::BTreeMap;
 use stage::Stage;
 
 const STEPS: usize = 100;
-/// Programs of an ordinary run.
+/// Number of programs of an ordinary run.
 const FEW: u64 = 12;
 
-/// Not a test of its own: what each of the processes does.
+/// The code of the processes; not a test of its own.
 #[test]
 fn child() {
     if std::env::var("PLAY").is_ok() {
@@ -36,7 +42,7 @@ fn child() {
     }
 }
 
-/// Says which program failed.
+/// Reports which program failed.
 struct Running(u64);
 
 impl Drop for Running {
@@ -73,7 +79,7 @@ fn processes_see_and_take_as_the_model_predicts() {
         drop(running);
     }
     eprintln!("{sights:#?}");
-    // One alone need not come across all.
+    // A single program need not come across everything.
     if one.is_none() {
         let not_seen = steps::not_seen(&sights);
         assert!(not_seen.is_empty(), "no program had {not_seen:?}, only {sights:#?}");

@@ -1,4 +1,4 @@
-//! What endpoints are by the rules of ROS 2 and of AXON's design, and what processes must see of them.
+//! The expected state of endpoints by the rules of ROS 2 and of AXON's design, and the processes' expected view of it.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -7,40 +7,40 @@ use super::{
     rules::same_type,
 };
 
-/// Of a publisher's history each process is allowed so many bytes.
+/// Bytes of a publisher's history that each process may keep.
 pub(super) const RING: u64 = 8 << 20;
-/// So much of it stands whatever the lengths of samples do to memory; the bound itself is the product's.
+/// Bytes of it that are certainly kept, whatever the lengths of the samples. The real bound is up to the
+/// implementation.
 const SURE: u64 = RING / 2;
 
-/// A longer sample may be in memory of its publisher that its readers hear of a little later.
+/// A longer sample may be in a segment of its publisher that its readers receive a little later.
 const COPIED: u64 = 4096;
 
-/// A node or an endpoint as the model has it.
+/// The model of a node or an endpoint.
 pub(super) struct Modelled {
     pub(super) gid: String,
     pub(super) process: usize,
     pub(super) what: Described,
-    /// A publisher: whether its clock is slow by [`SLOW`](super::stage::SLOW), and what it published.
+    /// For a publisher: true if its clock is slow by [`SLOW`](super::stage::SLOW); and the samples that it published.
     pub(super) slow: bool,
     pub(super) sequence: u64,
     pub(super) bytes: u64,
-    /// What of it late joiners get, oldest first.
+    /// The samples that late joiners get, oldest first.
     pub(super) history: BTreeMap<i64, Owed>,
-    /// What a subscription has to take, by the source's time.
+    /// The samples that a subscription has to take, by source time.
     pub(super) owed: BTreeMap<i64, Owed>,
     taken: u64,
     lost: u64,
     expired: u64,
-    /// Losses that its event was last seen to count.
+    /// The losses that its event counted when last seen.
     told: u64,
-    /// The requests that a server has to answer, and the responses that a client has to take, with
-    /// the other end of each.
+    /// The requests that a server has to answer, or the responses that a client has to take, each with the other end.
     pub(super) calls: BTreeSet<Call>,
-    /// What it met that it does not go with, and why the last of them did not.
+    /// The incompatible endpoints that it met, and the reasons of the last one.
     met: Met,
 }
 
-/// Everything that an endpoint met since it was made.
+/// Counts of everything that an endpoint met since it was created.
 #[derive(Default)]
 struct Met {
     matched: u64,
@@ -49,25 +49,25 @@ struct Met {
     types: u64,
 }
 
-/// A sample that somebody has to take.
+/// A sample that a subscription has to take.
 #[derive(Clone, Debug)]
 pub(super) struct Owed {
     pub(super) sample: Sample,
-    /// The process of its publisher, and the bytes that it had published before it.
+    /// The process of its publisher, and the bytes that the publisher had published before it.
     pub(super) process: usize,
     pub(super) behind: u64,
-    /// Whether it is too old to be delivered.
+    /// True if it is too old to be delivered.
     pub(super) expired: bool,
-    /// Whether its publisher waits rather than that this reader loses it.
+    /// True if its publisher waits rather than let this reader lose it.
     pub(super) held: bool,
 }
 
-/// What two endpoints are to each other.
+/// The relation of two endpoints.
 #[derive(Debug, PartialEq)]
 pub(super) enum Relation {
     None,
     Match,
-    /// They would match but for these policies.
+    /// They would match except for these policies.
     Qos(BTreeSet<String>),
     Type,
 }
@@ -103,7 +103,7 @@ impl Modelled {
         let (offers, wants) = match (self.what.kind, other.what.kind) {
             (Kind::Publisher, Kind::Subscription) => (&self.what, &other.what),
             (Kind::Subscription, Kind::Publisher) => (&other.what, &self.what),
-            // They differ in nothing but in how much they keep.
+            // Servers and clients differ only in how much they keep, so all are compatible.
             (Kind::Server, Kind::Client) | (Kind::Client, Kind::Server) => {
                 let same = self.what.topic == other.what.topic;
                 return if same { Relation::Match } else { Relation::None };
@@ -124,8 +124,8 @@ impl Modelled {
         self.relation(other) == Relation::Match
     }
 
-    /// The other was made, or it was, and the other is there. Of several that a new endpoint finds,
-    /// any may be the last.
+    /// Records that this endpoint and another one found each other. `new` is true if this endpoint was just created:
+    /// then any of the endpoints that it finds may be the last one.
     pub(super) fn meet(&mut self, relation: &Relation, new: bool) {
         match relation {
             Relation::None => {}
@@ -141,7 +141,7 @@ impl Modelled {
         }
     }
 
-    /// What its process must see of it, where these are matched with it.
+    /// Returns the state of this endpoint that its process must see, if `matched` are its matches.
     pub(super) fn sees(&self, matched: BTreeSet<String>) -> Own {
         let current = matched.len() as u64;
         let reports = matches!(self.what.kind, Kind::Publisher | Kind::Subscription);
@@ -152,14 +152,14 @@ impl Modelled {
             qos: self.met.qos,
             policy: None,
             types: self.met.types,
-            // No lease and no deadline is as short as a program takes.
+            // No lease and no deadline is so short that a program misses it.
             alive,
             ..Reported::default()
         });
         Own { matched, reported }
     }
 
-    /// Whether the policy that it names is one of those that it may.
+    /// Returns whether the named policy is one of the possible ones.
     pub(super) fn may_name(&self, policy: Option<&String>) -> bool {
         match policy {
             Some(policy) => self.met.policies.contains(policy),
@@ -167,7 +167,7 @@ impl Modelled {
         }
     }
 
-    /// Whether a wait finds it ready. How old a sample is, only taking it finds out.
+    /// Returns whether a wait finds it ready. An expired sample is only found out when it is taken.
     pub(super) fn is_ready(&self) -> bool {
         !self.owed.is_empty() || !self.calls.is_empty()
     }
@@ -176,7 +176,7 @@ impl Modelled {
         self.what.profile.depth.map_or(usize::MAX, |depth| depth as usize)
     }
 
-    /// A publisher keeps this for late joiners.
+    /// Adds a sample to a publisher's history for late joiners.
     pub(super) fn keep_history(&mut self, sample: &Owed) {
         self.history.insert(sample.sample.stamp, sample.clone());
         while self.history.len() > self.depth() {
@@ -184,7 +184,7 @@ impl Modelled {
         }
     }
 
-    /// A subscription has to take this, and may lose it unless it is `held` for it.
+    /// Adds a sample that a subscription has to take. It may lose the sample unless the sample is `held` for it.
     pub(super) fn owe(&mut self, sample: &Owed, held: bool) {
         self.owed.insert(sample.sample.stamp, Owed { held, ..sample.clone() });
         while self.owed.len() > self.depth() {
@@ -192,7 +192,7 @@ impl Modelled {
         }
     }
 
-    /// Of the requests of a client, or the responses of a server, it keeps the newest.
+    /// Adds a request of a client, or a response of a server; only the newest are kept.
     pub(super) fn keep_call(&mut self, other: &str, stamp: u64) {
         let of_other = (other.to_owned(), 0)..=(other.to_owned(), u64::MAX);
         self.calls.insert((other.to_owned(), stamp));
@@ -202,7 +202,7 @@ impl Modelled {
         }
     }
 
-    /// What it gets of a publisher that was there before it.
+    /// Adds the samples that it gets from a publisher that existed before it.
     pub(super) fn join(&mut self, publisher: &Self) {
         let both = [&publisher.what, &self.what].iter().all(|what| what.profile.transient_local);
         if both {
@@ -213,33 +213,33 @@ impl Modelled {
         }
     }
 
-    /// Whether this publisher loses nothing of what this reader has to take, but waits for it.
+    /// Returns whether this publisher waits for this reader rather than lose its samples.
     pub(super) fn waits_for(&self, reader: &Self) -> bool {
         let both = [&self.what, &reader.what];
         self.process != reader.process
             && both.iter().all(|what| what.profile.reliable && what.profile.depth.is_none())
     }
 
-    /// Bytes that it has to take of a publisher.
+    /// Returns the bytes of a publisher that it has to take.
     pub(super) fn backlog(&self, publisher: &str) -> u64 {
         let of = self.owed.values().filter(|owed| owed.sample.publisher == publisher);
         of.map(|owed| owed.sample.len).sum()
     }
 
-    /// Whether this reader may hold the publisher back.
+    /// Returns whether this reader may hold the publisher back.
     pub(super) fn may_hold(&self, publisher: &Self) -> bool {
         publisher.matches(self) && publisher.waits_for(self) && self.backlog(&publisher.gid) >= SURE
     }
 
-    /// Its event counts losses before anything is taken.
+    /// Records the losses that its event counts before anything is taken.
     pub(super) fn hear_of(&mut self, losses: Losses) {
         assert!(losses.total > self.told, "{losses:?}");
         assert_eq!(losses.change, losses.total - self.told);
         self.told = losses.total;
     }
 
-    /// Of one publisher samples come by number, of several by time. But nobody waits for memory of a
-    /// publisher that this process has not heard of yet.
+    /// Checks the order of samples. Samples of one publisher come by number, samples of several by time. But a
+    /// subscription does not wait for a segment of a publisher that its process has not received yet.
     fn assert_order(&self, taken: &[&Sample], due: &[&Owed]) {
         let late = |owed: &&&Owed| owed.process != self.process && owed.sample.len > COPIED;
         let late: BTreeSet<_> =
@@ -259,8 +259,8 @@ impl Modelled {
         assert_eq!(taken, due, "what was taken, and what there was to take");
     }
 
-    /// Holds what it took against what it had to. `published` says how many bytes each publisher has
-    /// published. How many were lost.
+    /// Compares the samples that it took with the samples that it had to take. `published` is the number of bytes that
+    /// each publisher has published. Returns the number of lost samples.
     pub(super) fn take(&mut self, taken: &Taken, published: &BTreeMap<String, u64>) -> u64 {
         let owed = std::mem::take(&mut self.owed);
         let mut numbers = taken.samples.iter().map(|(_, number)| *number);

@@ -1,4 +1,4 @@
-//! What a program's test tells its processes to do, and what they answer: a line of JSON each.
+//! The orders of a program's test to its processes, and their answers: one line of JSON each.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -15,11 +15,11 @@ pub(super) enum Kind {
     Client,
 }
 
-/// All that a graph says of a node or an endpoint.
+/// All properties of a node or an endpoint that a graph contains.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Described {
     pub(super) kind: Kind,
-    /// Or service; empty for a node.
+    /// The topic or service; empty for a node.
     pub(super) topic: String,
     pub(super) type_name: String,
     pub(super) hash: Vec<u8>,
@@ -29,42 +29,45 @@ pub(super) struct Described {
     pub(super) enclave: String,
 }
 
-/// What a process is to do. Endpoints go by the numbers that their test gives them.
+/// An order to a process. Endpoints are identified by the numbers that the test assigns.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) enum Order {
-    /// [`String`]: the GID. `by` is the number of the node that it belongs to.
+    /// Creates an endpoint or node. Answer: [`String`], the GID. `by` is the number of the node
+    /// that it belongs to.
     Create { id: u64, by: Option<u64>, what: Box<Described> },
-    /// [`Published`]: so many samples with source times from `stamp` on, or as many as find room.
+    /// Publishes `count` samples with source times from `stamp` on, or as many as fit. Answer:
+    /// [`Published`].
     Publish { id: u64, stamp: i64, count: u64, len: u64 },
-    /// [`Taken`]: all of so many samples that can be had.
+    /// Takes all of `owed` samples that can be had. Answer: [`Taken`].
     Take { id: u64, owed: u64 },
-    /// [`Losses`], once there are any.
+    /// Waits for losses. Answer: [`Losses`].
     AwaitLoss { id: u64 },
-    /// [`u64`]: the request's number.
+    /// Sends a request. Answer: [`u64`], the request's number.
     Ask { id: u64, stamp: u64, len: u64 },
-    /// The [`Call`]s that were answered: so many, and no more.
+    /// Answers `count` requests, and checks that there are no more. Answer: the [`Call`]s.
     Answer { id: u64, count: u64 },
-    /// The [`Call`]s whose answers came: so many, and no more.
+    /// Takes `count` responses, and checks that there are no more. Answer: the [`Call`]s.
     Hear { id: u64, count: u64 },
-    /// The numbers of all that a wait finds ready: at once, unless it is to find `some`.
+    /// Queries everything that a wait finds ready, at once, or, with `some`, once anything is.
+    /// Answer: the numbers.
     Wait { some: bool },
-    /// `()`.
+    /// Drops an endpoint or node. Answer: `()`.
     End { id: u64 },
-    /// [`State`].
+    /// Queries the state. Answer: [`State`].
     State,
 }
 
-/// What became of a publication.
+/// The result of publishing.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Published {
     /// The number of the first sample.
     pub(super) first: Option<u64>,
     pub(super) count: u64,
-    /// Whether a reader held the publisher back, after that many.
+    /// True if a reader held the publisher back after `count` samples.
     pub(super) blocked: bool,
 }
 
-/// A sample, as the process that takes it is told of it.
+/// A sample, with the metadata that the taking process gets.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Sample {
     pub(super) publisher: String,
@@ -73,54 +76,54 @@ pub(super) struct Sample {
     pub(super) len: u64,
 }
 
-/// A count of losses in all, and since it was looked at before.
+/// A count of losses: the total, and the change since the last query.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Losses {
     pub(super) total: u64,
     pub(super) change: u64,
 }
 
-/// What a subscription gave.
+/// The samples that a subscription took.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Taken {
-    /// In this order, and the number that each has among all that were taken.
+    /// The samples in order, each with its number among all that were taken.
     pub(super) samples: Vec<(Sample, u64)>,
-    /// As its event says, and as itself does.
+    /// The losses by the event, and by the subscription itself.
     pub(super) losses: Losses,
     pub(super) lost: u64,
     pub(super) expired: u64,
 }
 
-/// Who said what: the number that a request or response begins with.
+/// The sender of a request or response, and the number at its beginning.
 pub(super) type Call = (String, u64);
 
-/// What a publisher or subscription reports of itself.
+/// The statuses of a publisher or subscription.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Reported {
-    /// Matched ever, and now.
+    /// Number of matches so far, and now.
     pub(super) ever: u64,
     pub(super) current: u64,
-    /// Those that do not go with it by their QoS, and by which policy the last did not.
+    /// Number of endpoints with an incompatible QoS, and the policy of the last one.
     pub(super) qos: u64,
     pub(super) policy: Option<String>,
-    /// Those that have another type.
+    /// Number of endpoints with another type.
     pub(super) types: u64,
-    /// A subscription's publishers.
+    /// For a subscription: its publishers that are alive, and those that are not.
     pub(super) alive: u64,
     pub(super) not_alive: u64,
-    /// Deadlines missed, and a publisher's leases that ran out.
+    /// Number of missed deadlines, and of a publisher's expired leases.
     pub(super) late: u64,
     pub(super) lifeless: u64,
 }
 
-/// What a process sees of one of its own.
+/// A process's view of one of its endpoints.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct Own {
     pub(super) matched: BTreeSet<String>,
     pub(super) reported: Option<Reported>,
 }
 
-/// What a process sees.
+/// A process's view of everything.
 #[derive(Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct State {
     /// By GID.

@@ -1,4 +1,4 @@
-//! The processes of a program, and what they must be like after each step.
+//! The processes of a program, and the checks of their state after each step.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -15,10 +15,10 @@ use super::{
 };
 
 pub(super) const PROCESSES: usize = 3;
-/// By how much slow clocks are, in nanoseconds.
+/// Nanoseconds by which slow clocks are slow.
 pub(super) const SLOW: i64 = 2 * 3600 * 1_000_000_000;
 
-/// Its own: a test whose seed is all that need be known.
+/// A random number generator of this test, so that a seed determines a program.
 pub(super) struct Dice(u64);
 
 impl Dice {
@@ -40,19 +40,19 @@ impl Dice {
     }
 }
 
-/// The processes, and what they must be like.
+/// The processes, and the model of their state.
 pub(super) struct Stage {
     pub(super) host: Host,
     pub(super) players: Vec<Player>,
     pub(super) model: BTreeMap<u64, Modelled>,
-    /// Bytes that publishers published, those that are gone, too.
+    /// Bytes that each publisher published, including publishers that are gone.
     pub(super) published: BTreeMap<String, u64>,
     next: u64,
-    /// The last source time, by a clock that is right.
+    /// The last source time by a correct clock.
     pub(super) clock: i64,
     pub(super) calls: u64,
     pub(super) dice: Dice,
-    /// What happened, and how often.
+    /// The situations that occurred, with their counts.
     pub(super) sights: BTreeMap<String, u64>,
     orders: Vec<String>,
 }
@@ -79,7 +79,7 @@ impl Stage {
         *self.sights.entry(what.into()).or_default() += 1;
     }
 
-    /// Has a process do something, and hears what comes of it.
+    /// Sends an order to a process, and returns the answer.
     pub(super) fn ask<T: DeserializeOwned>(&mut self, process: usize, order: &Order) -> T {
         let line = serde_json::to_string(order).unwrap();
         if !matches!(order, Order::State) {
@@ -97,7 +97,7 @@ impl Stage {
         (!ids.is_empty()).then(|| self.dice.one_of(&ids))
     }
 
-    /// One of those that suit best, if there are any.
+    /// Picks one that is `best`, or else any.
     pub(super) fn pick_best(
         &mut self,
         which: impl Fn(&Modelled) -> bool,
@@ -106,7 +106,7 @@ impl Stage {
         self.pick(|m| which(m) && best(m)).or_else(|| self.pick(which))
     }
 
-    /// Makes something, and has it meet all that is there.
+    /// Creates a node or an endpoint, and records its relations to all existing ones.
     pub(super) fn make(
         &mut self,
         process: usize,
@@ -138,7 +138,7 @@ impl Stage {
         id
     }
 
-    /// Waits until every process sees what the model says.
+    /// Waits until every process sees the state of the model.
     pub(super) fn settle(&mut self) {
         let graph = self.model.values().map(|m| (m.gid.clone(), m.what.clone()));
         let graph: BTreeMap<String, Described> = graph.collect();

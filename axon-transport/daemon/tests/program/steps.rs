@@ -13,10 +13,10 @@ use super::{
 };
 
 const HOUR: u64 = 3600;
-/// A flood is more than twice what a ring keeps.
+/// Number and length of the samples of a flood: more than twice what a ring keeps.
 const FLOOD: (u64, u64) = (1000, 20_000);
 
-/// What a run of programs must have come across, besides the policies.
+/// The situations that a run of programs must come across, besides the policies.
 pub(super) const SIGHTS: [&str; 21] = [
     "create",
     "publish",
@@ -47,14 +47,14 @@ impl Relation {
             Self::None => BTreeSet::new(),
             Self::Match => ["match".to_owned()].into(),
             Self::Type => ["another type".to_owned()].into(),
-            // Which of several is named is not said.
+            // If several policies mismatch, it is not specified which one is named.
             Self::Qos(policies) if policies.len() == 1 => policies.clone(),
             Self::Qos(_) => BTreeSet::new(),
         }
     }
 }
 
-/// The sights and policies that a run has not come across.
+/// Returns the situations and policies that a run has not come across.
 pub(super) fn not_seen(sights: &BTreeMap<String, u64>) -> Vec<&'static str> {
     SIGHTS.into_iter().chain(POLICIES).filter(|sight| !sights.contains_key(*sight)).collect()
 }
@@ -109,7 +109,7 @@ impl Stage {
         true
     }
 
-    /// Has every other endpoint go with one that there is: few that know nothing of each other do.
+    /// Makes half of the new endpoints compatible with an existing one. Few random pairs are.
     fn suit_somebody(&mut self, what: &mut Described) {
         let other = match what.kind {
             Kind::Publisher => Kind::Subscription,
@@ -141,20 +141,20 @@ impl Stage {
         };
         match kind {
             Kind::Node => Described {
-                // Several may have one name.
+                // Several nodes may have the same name.
                 node: dice.one_of(&["left", "right"]).to_owned(),
                 namespace: dice.one_of(&["/", "/front", "/front/low"]).to_owned(),
                 enclave: dice.one_of(&["/", "/robot"]).to_owned(),
                 ..nothing
             },
-            // They differ in how much they keep: all of them go together.
+            // They differ only in how much they keep, so all are compatible.
             Kind::Server | Kind::Client => Described {
                 topic: format!("/s{number}"),
                 type_name: "test/Echo".to_owned(),
                 profile: Profile { depth: profile.depth, ..Profile::default() },
                 ..nothing
             },
-            // Of the second topic not all have one type, and not all know its hash.
+            // On the second topic, not all endpoints have the same type, and not all know its hash.
             Kind::Publisher | Kind::Subscription => {
                 let other = number == 1 && dice.roll(5) == 0;
                 let hashes = [vec![7; 32], vec![7; 32], vec![8; 32], vec![]];
@@ -184,7 +184,7 @@ impl Stage {
         true
     }
 
-    /// Those that are matched with somebody who is like this to them.
+    /// Returns the endpoints that are matched with an endpoint for which `like` holds.
     fn matched(&self, like: impl Fn(&Modelled, &Modelled) -> bool) -> BTreeSet<String> {
         let mut matched = self.model.values().collect::<Vec<_>>();
         matched.retain(|m| self.model.values().any(|other| m.matches(other) && like(m, other)));
@@ -195,7 +195,7 @@ impl Stage {
         self.matched(|_, _| true)
     }
 
-    /// The publishers that readers may hold back.
+    /// Returns the publishers that readers may hold back.
     fn held(&self) -> BTreeSet<String> {
         self.matched(Modelled::waits_for)
     }
@@ -210,7 +210,7 @@ impl Stage {
         let next = publisher.sequence + 1;
         assert_eq!(published.first, (published.count > 0).then_some(next), "numbers go up by one");
         let lifespan = publisher.what.profile.lifespan;
-        // By age, whatever its clock says.
+        // Expiry goes by age, whatever the publisher's clock says.
         let expired = lifespan == Some(0);
         for done in 0..published.count {
             let sample = Sample {
@@ -239,9 +239,9 @@ impl Stage {
         published
     }
 
-    /// More than a ring keeps, while nobody takes.
+    /// Publishes more than a ring keeps, while nobody takes.
     fn flood(&mut self) -> bool {
-        // What late joiners get, and what is too old, is not told apart from what is lost.
+        // The model cannot tell samples that late joiners get, or that expire, from lost ones.
         let which = |m: &Modelled| {
             let Profile { transient_local, lifespan, .. } = m.what.profile;
             m.is(Kind::Publisher) && !transient_local && lifespan != Some(0)
@@ -276,7 +276,7 @@ impl Stage {
             self.saw("publisher held back");
             return true;
         }
-        // A reader that loses samples hears of it before anything is taken.
+        // A reader that loses samples is told before anything is taken.
         let losers = readers().filter(|(_, reader)| reader.what.profile.depth.is_none());
         let losers: Vec<(u64, usize)> = losers.map(|(id, reader)| (*id, reader.process)).collect();
         for (id, process) in losers {
@@ -311,7 +311,7 @@ impl Stage {
         true
     }
 
-    /// A client asks all servers that there are.
+    /// Lets a client send requests to all servers.
     fn request(&mut self) -> bool {
         let heard = self.heard();
         let which = |m: &Modelled| m.is(Kind::Client);
@@ -334,7 +334,7 @@ impl Stage {
         true
     }
 
-    /// A server answers all that it was asked.
+    /// Lets a server answer all its requests.
     fn answer(&mut self) -> bool {
         let which = |m: &Modelled| m.is(Kind::Server);
         let Some(id) = self.pick_best(which, |m| !m.calls.is_empty()) else { return false };
@@ -344,7 +344,7 @@ impl Stage {
         let count = requests.len() as u64;
         let answered: BTreeSet<Call> = self.ask(process, &Order::Answer { id, count });
         assert_eq!(answered, requests, "server {id}");
-        // A client that is gone gets nothing.
+        // A client that is gone gets no response.
         for (client, stamp) in requests {
             if let Some(client) = self.model.values_mut().find(|other| other.gid == client) {
                 client.keep_call(&gid, stamp);
@@ -365,7 +365,7 @@ impl Stage {
         count > 0
     }
 
-    /// A process waits for all that it has.
+    /// Lets a process wait for all its endpoints.
     fn wait(&mut self) -> bool {
         let which = if self.dice.roll(2) > 0 { self.pick(Modelled::is_ready) } else { None };
         let process = which.map_or_else(|| self.dice.process(), |id| self.model[&id].process);
@@ -409,7 +409,7 @@ impl Stage {
     }
 }
 
-/// All of them go together well enough for something to be heard.
+/// Returns a profile. Most pairs of them are compatible, so that samples are received.
 fn profile(dice: &mut super::stage::Dice) -> Profile {
     let period = |roll: u64| [HOUR, 2 * HOUR].get(roll as usize).copied();
     Profile {

@@ -1,5 +1,4 @@
-//! The statuses of a publisher or subscription, looked at again and again: what changed since the look
-//! before adds up to what they say there was in all.
+//! Watches the statuses of a publisher or subscription: the sum of the changes must equal the reported totals.
 
 use std::cell::{Cell, RefCell};
 
@@ -15,15 +14,15 @@ pub(super) struct Watch {
     qos: Event,
     types: Event,
     late: Event,
-    /// A subscription's LIVELINESS_CHANGED, or a publisher's LIVELINESS_LOST.
+    /// LIVELINESS_CHANGED of a subscription, or LIVELINESS_LOST of a publisher.
     life: Event,
     lost: Option<Event>,
     sums: RefCell<Sums>,
-    /// Samples that were lost or too old, of those that the test has accounted for.
+    /// Number of lost and expired samples that the test has accounted for.
     gone: Cell<u64>,
 }
 
-/// All changes since the endpoint was made.
+/// The sums of all changes since the endpoint was created.
 #[derive(Default)]
 struct Sums {
     ever: u64,
@@ -70,7 +69,7 @@ impl Watch {
         Self { matched, qos, types, late, life, lost, sums, gone }
     }
 
-    /// A subscription's.
+    /// Returns the event of a subscription's losses.
     pub(super) fn lost(&self) -> &Event {
         self.lost.as_ref().expect("a subscription's")
     }

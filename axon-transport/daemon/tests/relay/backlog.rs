@@ -1,4 +1,5 @@
-//! What nobody has taken yet: whom it holds back, and whom it outlives.
+//! Messages that nobody has taken yet: the writers that they hold back, and the endpoints that they
+//! outlive.
 
 use axon_transport::Waitable;
 
@@ -30,7 +31,7 @@ fn keep_last_services_get_the_newest_messages_and_block_no_peer() {
         let client = there.create_client(service().qos(newest)).unwrap();
         assert!(client.wait_available(PATIENCE));
         until("the server counts it", || server.clients() == [client.gid()]);
-        // Unless all that comes is taken or passed over the ring on one way would be full.
+        // The ring of one hop would be full if not all arriving messages were taken or skipped.
         for number in 1..=MANY {
             patiently(|| client.send_request(&pattern(number, 50_000)));
         }

@@ -1,4 +1,4 @@
-//! Daemons that are killed while calls of relayed sessions are on their way through them.
+//! Daemons that are killed while calls of relayed sessions pass through them.
 
 use std::{collections::HashSet, sync::mpsc};
 
@@ -9,7 +9,7 @@ use super::{
     *,
 };
 
-/// Runs a test with a relayed client, and a server that is relayed, or that shares memory.
+/// Runs a test with a relayed client, and a server that is relayed or shares memory.
 fn with_either_server(test: impl Fn(&Host, Kept, &Server, &Client)) {
     for server_shares in [false, true] {
         let host = host();
@@ -22,7 +22,7 @@ fn with_either_server(test: impl Fn(&Host, Kept, &Server, &Client)) {
     }
 }
 
-/// The same, and besides a client that shares memory with a server that is relayed.
+/// Like [`with_either_server`], and also with a client that shares memory and a relayed server.
 fn with_any_client(test: impl Fn(&Host, Kept, &Server, &Client)) {
     with_either_server(&test);
     with_sharing_client(test);
@@ -47,7 +47,7 @@ fn response(client: &Client) -> u64 {
     client.recv_response(&mut Vec::new(), Some(PATIENCE)).expect("a response").sequence
 }
 
-/// Neither end gets anything more, and calls go on.
+/// Checks that neither end gets anything more, and that calls still work.
 fn nothing_is_left(server: &Server, client: &Client) {
     until("the client counts the server", || client.servers().contains(&server.gid()));
     thread::scope(|scope| {
@@ -63,7 +63,7 @@ fn request_that_a_killed_daemon_had_comes_through_the_next() {
     with_any_client(|host, daemon, server, client| {
         stop(&daemon);
         let number = client.send_request(b"to nobody yet").unwrap();
-        // It may be with the daemon by then, or still here.
+        // The request may be in the daemon by then, or still in this process.
         thread::sleep(Duration::from_millis(50));
         drop(daemon);
         let _daemon = host.daemon();
@@ -110,7 +110,7 @@ fn responses_that_a_killed_daemon_had_come_through_the_next() {
         let numbers: Vec<u64> = (0..8).map(|_| client.send_request(b"taken").unwrap()).collect();
         numbers.iter().for_each(|number| assert_eq!(take(server), *number));
         stop(&daemon);
-        // In another order, and longer than what is kept together with its descriptor.
+        // The responses come in another order, and are longer than what is stored in a descriptor.
         for number in numbers.iter().rev() {
             respond(server, client.gid(), *number, &[7; 9000]);
         }
@@ -132,7 +132,7 @@ fn many_calls_survive_killed_daemons_and_no_server_sees_one_twice() {
 
 #[test]
 fn many_calls_of_a_client_that_shares_memory_survive_killed_daemons() {
-    // It may get a response twice.
+    // The client may get a response twice.
     with_sharing_client(|host, daemon, server, client| {
         many_calls(host, daemon, server, client, true);
     });
@@ -168,7 +168,7 @@ fn many_calls(host: &Host, daemon: Kept, server: &Server, client: &Client, twice
             for number in 1..=CALLS {
                 let bytes = pattern(number, len_of(number));
                 assert_eq!(patiently(|| client.send_request(&bytes)), number);
-                // Some are in flight whenever the daemon is killed.
+                // Some calls are in flight whenever the daemon is killed.
                 until("the others are answered", || {
                     number <= u64::from(answered.load(Ordering::Relaxed)) + 200
                 });

@@ -1,4 +1,4 @@
-//! Who says what no session says.
+//! Peers that send what no session sends.
 
 use std::process::{Command, Stdio};
 
@@ -9,7 +9,7 @@ use rustix::{
 
 use super::*;
 
-/// What a session under the id of nines says first.
+/// The first message of a session whose id consists of nines.
 pub(super) fn hello(host: &Host) -> SessionHello {
     hello_of(&host.config())
 }
@@ -35,7 +35,7 @@ pub(crate) fn say_to(socket: &OwnedFd, message: &SessionMessage) {
     }
 }
 
-/// The next message that `want` wants; `None` at the end of the connection.
+/// Returns the next message that `want` accepts; `None` at the end of the connection.
 pub(crate) fn hear(
     socket: &OwnedFd,
     want: impl Fn(&SessionMessage) -> bool,
@@ -63,7 +63,7 @@ fn refused(host: &Host, hello: SessionHello) -> SessionRefused {
     }
 }
 
-/// A relayed session that does as the test does.
+/// Connects as a relayed session whose messages the test sends.
 pub(super) fn by_hand(host: &Host, hello: SessionHello) -> OwnedFd {
     let socket = Address::of(&host.config()).connect().unwrap();
     say_to(&socket, &SessionMessage::Hello(hello));
@@ -106,7 +106,7 @@ fn sessions_that_may_not_be_relayed_are_refused() {
     let empty = SessionHello { relay: None, ..hello(&host) };
     assert_eq!(refused(&host, empty).variable, "AXON_SHM", "it may come back to be relayed");
 
-    // An id that another process has, or one like it, and one session too many.
+    // The id of another process, an id that differs from it only in its last byte, and one session too many.
     let witness = session(&host, "witness", false);
     let theirs = SessionHello { session: witness.id(), ..hello(&host) };
     let alike = {
@@ -133,7 +133,7 @@ pub(crate) fn stop(daemon: &Kept) {
     waitid(id, WaitIdOptions::STOPPED).unwrap();
 }
 
-/// In a child: a relayed session that does as the test does.
+/// In a child: connects as a relayed session whose messages the test sends.
 fn call() -> OwnedFd {
     let config = Config::from_env().unwrap();
     let socket = Address::of(&config).connect().unwrap();
@@ -141,7 +141,7 @@ fn call() -> OwnedFd {
     socket
 }
 
-/// In a child: calls, and leaves the connection to a process that reads until the other end hangs up.
+/// In a child: connects, and leaves the connection to a process that reads until the other end hangs up.
 pub(crate) fn call_and_leave() -> u32 {
     let socket = call();
     rustix::io::ioctl_fionbio(&socket, false).unwrap();
@@ -149,7 +149,7 @@ pub(crate) fn call_and_leave() -> u32 {
     holder.expect("cat is there").id()
 }
 
-/// In a child: calls, and leaves the connection to a process that talks until the other end hangs up.
+/// In a child: connects, and leaves the connection to a process that sends until the other end hangs up.
 pub(crate) fn call_and_have_it_talk() -> u32 {
     let socket = call();
     assert!(matches!(hear(&socket, |_| true), Some(SessionMessage::Welcome(_))));
@@ -158,12 +158,12 @@ pub(crate) fn call_and_have_it_talk() -> u32 {
     holder.expect("yes is there").id()
 }
 
-/// The publisher of a peer that speaks for itself.
+/// The publisher of a peer whose messages the test sends.
 pub(super) fn own() -> Gid {
     Gid::new(SessionId([9; 16]), 1)
 }
 
-/// Has it publish as many as may be under way together; the bytes that it may send.
+/// Announces the publisher, and waits for its credit. Returns the bytes that it may send.
 pub(super) fn announce_and_await_credit(socket: &OwnedFd) -> u64 {
     say_to(socket, &announce(own(), EndpointKind::Publisher, EndpointRole::Application));
     let credit =
@@ -193,7 +193,7 @@ fn say_all(socket: &OwnedFd) {
     }
 }
 
-/// In a child: publishes when it is told to.
+/// In a child: publishes when the test tells it to.
 pub(crate) fn publish_when_told() {
     let socket = call();
     assert!(matches!(hear(&socket, |_| true), Some(SessionMessage::Welcome(_))));
@@ -262,7 +262,7 @@ fn messages_sent_by_a_process_before_it_was_killed_are_processed() {
     stop(&daemon);
     publisher.go();
     assert_eq!(publisher.hear(), "said");
-    // Both its end and that of the connection are there to be seen before anything that it said is heard.
+    // The daemon can see the end of the process and of the connection before it reads any message of them.
     drop(publisher);
     signal(daemon.0.id(), Signal::CONT);
     assert!(take_until(&subscription, SAID).into_iter().eq(1..=SAID));
@@ -294,7 +294,7 @@ fn a_process_that_ended_before_it_is_served_is_not_served() {
     caller.go();
     let pid: i32 = caller.hear().parse().unwrap();
     let holder = pidfd_open(Pid::from_raw(pid).unwrap(), PidfdFlags::empty()).unwrap();
-    // It is gone and forgotten: its number may be another's.
+    // The process is reaped: another process may have its number.
     caller.finish();
     signal(daemon.0.id(), Signal::CONT);
     let patience = PATIENCE.try_into().unwrap();
@@ -338,7 +338,7 @@ fn hostile_frames_end_their_own_relay_and_nothing_else() {
         &[piece(own, Some(100_000), 31_000), piece(own, None, 31_000)],
     ] {
         let socket = credited();
-        // It hears them together: after the first of a long sample alone it would make room for it.
+        // The daemon must read them together: after only the first piece of a long sample it would make room for it.
         stop(&daemon);
         let packets = pieces.iter().map(|piece| piece.encode().unwrap());
         packets.for_each(|packet| socket::send(&socket, &packet, &[]).unwrap());
@@ -348,7 +348,7 @@ fn hostile_frames_end_their_own_relay_and_nothing_else() {
     for packet in [&[][..], &[25], &[25, 0xff, 0xff], &[0xff; 32 * 1024]] {
         let socket = by_hand(&host, hello(&host));
         let _ = socket::send(&socket, packet, &[]);
-        // What it does not know it passes over.
+        // The daemon skips messages that it does not know.
         let _ = socket::send(&socket, &SessionMessage::Resync.encode().unwrap(), &[]);
         assert!(hear(&socket, |_| false).is_none());
     }
@@ -358,7 +358,7 @@ fn hostile_frames_end_their_own_relay_and_nothing_else() {
     socket::send(&socket, &SessionMessage::Resync.encode().unwrap(), &descriptor).unwrap();
     assert!(hear(&socket, |_| false).is_none(), "descriptors");
 
-    // Samples of another's publisher go nowhere.
+    // Samples in the name of another session's publisher are dropped.
     let socket = credited();
     say_to(&socket, &piece(publisher.gid(), Some(4), 4));
     // Samples that nobody reads are done with at once, however many they are.
@@ -371,7 +371,7 @@ fn hostile_frames_end_their_own_relay_and_nothing_else() {
     });
 }
 
-/// A server of its own that answers these clients, as far as it says.
+/// Connects as a server of its own that answers these clients, according to its messages.
 fn server_for(host: &Host, own: Gid, others: Vec<Gid>) -> OwnedFd {
     let socket = by_hand(host, hello(host));
     say_to(&socket, &announce(own, EndpointKind::Server, EndpointRole::Application));
@@ -401,7 +401,7 @@ fn unrequested_responses_of_a_hostile_server_reach_no_client() {
         })
     };
 
-    // Not its own, or no server.
+    // The endpoint is not its own, or is no server.
     for gid in [server.gid(), client.gid(), Gid([7; 16])] {
         let socket = by_hand(&host, hello(&host));
         say_to(&socket, &SessionMessage::Matched(RelayMatched { gid, others: vec![client.gid()] }));
@@ -414,18 +414,18 @@ fn unrequested_responses_of_a_hostile_server_reach_no_client() {
         &SessionMessage::Matched(RelayMatched { gid: own, others: vec![server.gid()] }),
     );
     assert!(hear(&socket, |_| false).is_none(), "a client answers nobody");
-    // More than it may.
+    // More clients than it may have.
     let many = (0..1025).map(|number| Gid::new(SessionId([8; 16]), number)).collect();
     assert!(hear(&server_for(&host, own, many), |_| false).is_none());
-    // More than there is credit for.
+    // More bytes than there is credit for.
     let socket = server_for(&host, own, vec![client.gid()]);
     let credit = |m: &SessionMessage| matches!(m, SessionMessage::Credit(c) if c.publisher == own && c.client == Some(client.gid()));
     assert!(hear(&socket, credit).is_some());
     say_to(&socket, &answer(own, client.gid(), 10, 11));
     assert!(hear(&socket, |_| false).is_none());
 
-    // For others, and before it says whom it answers, it goes nowhere. To whom it is not matched with,
-    // too, and that is done with at once.
+    // A response in the name of another server is dropped, and so is one before the server says whom it answers. A
+    // response to a client with which it is not matched is dropped as well, and is done with at once.
     let stranger = Gid([5; 16]);
     let socket = server_for(&host, own, vec![stranger]);
     say_to(&socket, &answer(server.gid(), client.gid(), 4, 4));
@@ -437,7 +437,7 @@ fn unrequested_responses_of_a_hostile_server_reach_no_client() {
         say_to(&socket, &answer(own, stranger, 0, 0));
         assert!(hear(&socket, opened).is_some());
     }
-    // Its word does not keep a publisher alive that is not its own.
+    // It cannot assert the liveliness of publishers that are not its own.
     let publishers = vec![server.gid(), own, stranger];
     say_to(&socket, &SessionMessage::Asserted(Asserted { publishers }));
     assert!(client.recv_response(&mut Vec::new(), Some(Duration::from_millis(20))).is_err());

@@ -1,14 +1,14 @@
-//! Daemons that are killed while samples are on their way through them.
+//! Daemons that are killed while samples pass through them.
 
 use super::*;
 use crate::support::Player;
 
-/// At least one sample is on its way whenever the daemon is killed.
+/// Length of a sample, such that at least one sample is in flight whenever the daemon is killed.
 fn len_of(sequence: u64) -> usize {
     if sequence.is_multiple_of(50) { 40_000 } else { 90 }
 }
 
-/// Kills the daemon, and starts the next.
+/// Kills the daemon, and starts the next one.
 fn replace(host: &Host, daemon: &mut Option<Kept>) {
     drop(daemon.take());
     *daemon = Some(host.daemon());
@@ -18,7 +18,7 @@ fn depth_four(reliability: Reliability) -> Qos {
     Qos::default().with_reliability(reliability).with_depth(4)
 }
 
-/// Has the daemon end in good order, and starts the next.
+/// Ends the daemon in good order, and starts the next one.
 fn relieve(host: &Host, daemon: &mut Option<Kept>) {
     if let Some(Kept(child)) = daemon {
         signal(child.id(), Signal::TERM);
@@ -51,7 +51,7 @@ fn keep_all_survives(end: fn(&Host, &mut Option<Kept>)) {
                 for sequence in 1..=SAMPLES {
                     let sample = pattern(sequence, len_of(sequence));
                     assert_eq!(publish(&publisher, &sample), sequence);
-                    // It goes on while there is no daemon, too.
+                    // It also goes on while there is no daemon.
                     if sequence.is_multiple_of(4) {
                         thread::sleep(Duration::from_millis(1));
                     }
@@ -96,7 +96,7 @@ fn a_full_path_survives_killed_daemons() {
             await_pair(&publisher, &subscription);
         }
         let ends = (from_shares, to_shares);
-        // What its reader did not take is still in its ring, or comes with the next.
+        // Samples that its reader did not take are still in its ring, or come with the next daemon.
         for sequence in last + 1..=last + 20 {
             if publisher.publish(&pattern(sequence, 50_000)).is_err() {
                 break;
@@ -125,7 +125,7 @@ fn unread_samples_of_a_relayed_reader_are_not_acknowledged() {
         let to = session(&host, "to", to_shares);
         let topic = format!("/of/{from_shares}");
         let (publisher, subscription) = connect(&from, &to, &topic, Qos::keep_all());
-        // More than all that lies in between may hold.
+        // More than all buffers on the way can hold.
         let last = fill(|number| publisher.publish(&pattern(number, 50_000)));
         assert!(!publisher.wait_acknowledged(Duration::from_millis(50)));
         assert_eq!(take_until(&subscription, last).len() as u64, last);
@@ -188,10 +188,10 @@ fn samples_of_a_dropped_publisher_go_through_the_next_daemon() {
     }
 }
 
-/// What such a child publishes.
+/// Number of samples that such a child publishes.
 const LEFT: u64 = 20;
 
-/// In a child: publishes a little when it is told to, and ends when it is told so. Its output has its log.
+/// In a child: publishes a little when told to, and ends when told to. Its log goes to its output.
 pub(super) fn publish_and_end(session: &Session) {
     let warnings = tracing_subscriber::fmt().with_max_level(tracing::Level::WARN);
     warnings.with_ansi(false).with_writer(std::io::stdout).init();
@@ -207,7 +207,7 @@ pub(super) fn publish_and_end(session: &Session) {
     std::io::stdin().read_line(&mut line).unwrap();
 }
 
-/// Samples that a process counted as lost when it ended, by its log.
+/// Returns the number of samples that a process counted as lost when it ended, from its log.
 fn given_up(log: &[String]) -> u64 {
     let lost = log.iter().filter(|line| line.contains("gave up samples: no daemon confirmed them"));
     lost.filter_map(|line| {
@@ -217,8 +217,8 @@ fn given_up(log: &[String]) -> u64 {
     .sum()
 }
 
-/// A relayed process that has published and not ended yet, and a subscription that shares memory; the
-/// daemon between them is gone. What is named last is dropped first.
+/// A relayed process that has published and not ended yet, and a subscription that shares memory. The daemon between
+/// them is stopped. Tests destructure it, so that the fields are dropped from the last to the first.
 struct Leaving {
     host: Host,
     _relaying: Host,
@@ -247,8 +247,8 @@ fn a_process_that_ends_hands_over_to_the_next_daemon() {
     let Leaving { host, _relaying, _listener, subscription, mut leaver } = Leaving::new();
     let _daemon = host.daemon();
     leaver.go();
-    // It waits for a second at most, which may be too short for a slow machine: what it could not hand over
-    // it counts, though some of that may have arrived.
+    // The process waits at most a second, which may be too short on a slow machine. It counts the samples that it could
+    // not hand over as lost, although some of them may have arrived.
     let lost = given_up(&leaver.finish_and_tell());
     let mut bytes = Vec::new();
     let mut taken = 0;
@@ -306,12 +306,12 @@ fn a_reader_that_stays_away_holds_its_publisher_for_a_while_only() {
     for publisher in &publishers {
         fill(|_| publisher.publish(&vec![0; 100_000]));
     }
-    // The daemon does not live to see it end.
+    // The daemon is killed before it sees the end of the process.
     stop(&daemon);
     signal(deaf.pid(), Signal::KILL);
     drop(daemon);
     let _daemon = host.daemon();
-    // It may have been killed with the daemon, or be stopped: they wait for a while.
+    // The process may have been killed with the daemon, or be stopped, so the publishers wait for a while.
     for (publisher, of) in publishers.iter().zip(["sharing", "relayed"]) {
         publish(publisher, &vec![0; 100_000]);
         assert!(!publisher.wait_acknowledged(PATIENCE), "{of}");
@@ -357,7 +357,7 @@ fn keep_last_and_best_effort_losses_of_a_killed_daemon_are_counted() {
             let keeps = Qos::keep_all().with_reliability(reliability);
             let subscription = to.create_subscription(spec("/t", keeps)).unwrap();
             await_pair(&publisher, &subscription);
-            // Before its first sample a subscription does not know what there was.
+            // Before its first sample, a subscription does not know which samples came before.
             let mut published = publish(&publisher, &pattern(1, 10));
             assert_eq!(take_until(&subscription, 1), [1]);
             for _ in 0..2 {
@@ -396,7 +396,7 @@ fn a_late_joiner_gets_the_history_from_the_next_daemon() {
         publish(&publisher, &pattern(31, 10));
         assert_eq!((take_until(&first, 31), take_until(&joiner, 31)), (vec![31], vec![31]));
         assert_eq!((first.lost(), joiner.lost()), (0, 0), "{ends:?}");
-        // Who comes later gets it, too.
+        // A late joiner gets them, too.
         let late = to.create_subscription(spec("/t", all)).unwrap();
         assert!(take_until(&late, 31).into_iter().eq(1..=31), "{ends:?}");
     }

@@ -1,4 +1,4 @@
-//! What a process leaves that ends: readers take it, or the daemon counts it and says so.
+//! The samples that a process leaves when it ends: readers take them, or the daemon counts and reports them.
 
 use std::fs;
 
@@ -6,11 +6,11 @@ use axon_transport::internal::session::relayed::flow::OVERHEAD;
 
 use super::{hostile::*, *};
 
-/// Bytes of each sample.
+/// Length of each sample in bytes.
 const LENGTH: usize = 1000;
 
-/// Publishes by hand, as far as there is credit, until the reader's ring is full and takes no more; how many were
-/// sent whole. A part of one more follows.
+/// Publishes by hand, within the credit, until the reader's ring is full. Returns the number of samples that were sent
+/// whole. A part of one more follows.
 fn send_until_held_back(host: &Host, socket: &OwnedFd, mut credit: u64) -> u64 {
     let cost = LENGTH as u64 + OVERHEAD;
     let mut sent = 0;
@@ -22,7 +22,7 @@ fn send_until_held_back(host: &Host, socket: &OwnedFd, mut credit: u64) -> u64 {
             say_to(socket, &fragment(sent, LENGTH));
             credit -= cost;
         }
-        // The daemon has all that was sent before it shows its status a second time.
+        // Everything that was sent before has reached the daemon when it shows its status a second time.
         let now = written();
         let is_held_back = now > 0 && now < sent && std::mem::replace(&mut before, now) == now;
         let more = credits(socket);
@@ -35,12 +35,12 @@ fn send_until_held_back(host: &Host, socket: &OwnedFd, mut credit: u64) -> u64 {
     }
 }
 
-/// The sample of this number, or the part of it that has so many bytes.
+/// Returns the message with the first `bytes` bytes of the sample of this number.
 fn fragment(sequence: u64, bytes: usize) -> SessionMessage {
     after_loss(sequence, bytes, 0)
 }
 
-/// The same, of a publisher that lost so many samples before it.
+/// Like [`fragment`], for a publisher that lost `lost` samples before it.
 fn after_loss(sequence: u64, bytes: usize, lost: u64) -> SessionMessage {
     let (length, source_timestamp, published) = (LENGTH as u32, 0, 0);
     let head = Some(SampleHeader { length, sequence, source_timestamp, lost, published });
@@ -48,7 +48,7 @@ fn after_loss(sequence: u64, bytes: usize, lost: u64) -> SessionMessage {
     SessionMessage::SampleFragment(SampleFragment { publisher: own(), head, bytes, client: None })
 }
 
-/// The credit that has come.
+/// Returns the bytes of the credit that has arrived.
 fn credits(socket: &OwnedFd) -> u64 {
     let mut bytes = 0;
     while let Ok(received) = socket::receive(socket, &mut Vec::new()) {
@@ -59,7 +59,7 @@ fn credits(socket: &OwnedFd) -> u64 {
     bytes
 }
 
-/// Samples of "/t" that the status counts as lost with this cause.
+/// Returns the samples of "/t" that the status counts as lost with this cause.
 pub(super) fn dropped(host: &Host, cause: &str) -> u64 {
     let topics = host.status().unwrap().topics;
     topics.iter().filter(|t| t.topic == "/t").filter_map(|t| t.dropped.get(cause)).sum()
@@ -81,7 +81,7 @@ fn undelivered_samples_of_an_ended_process_are_counted_by_topic() {
     let taken = std::iter::from_fn(|| Some(subscription.take(&mut bytes)?.sequence));
     let taken: Vec<u64> = taken.collect();
     assert!(taken.iter().copied().eq(1..=taken.len() as u64), "{taken:?}");
-    // The sample that came in part is lost as well.
+    // The partial sample is lost as well.
     assert_eq!(taken.len() as u64 + dropped(&host, "publisher_ended"), sent + 1);
     let log = fs::read_to_string(host.log()).unwrap();
     let told = |line: &str| line.contains("discarded samples") && line.contains("topic=\"/t\"");
@@ -104,10 +104,10 @@ fn samples_lost_at_the_start_and_the_end_are_counted_by_topic() {
         let sample = subscription.recv(&mut bytes, Some(PATIENCE)).expect("a sample");
         assert_eq!(sample.sequence, number);
     }
-    // The subscription knows what is between two samples. Only status knows what was before the first.
+    // The subscription knows the losses between two samples. Only the status knows the losses before the first.
     assert_eq!(subscription.lost(), 3);
     until("the topic's count", || dropped(&host, "queue") == 10);
-    // The beginning of one more, and the end of the process.
+    // A part of one more sample, and the end of the process.
     say_to(&socket, &after_loss(13, LENGTH / 2, 0));
     drop(socket);
     until("nobody is relayed any more", || relays(&host.status().unwrap()).is_empty());
@@ -126,7 +126,7 @@ fn losses_that_cannot_be_are_not_counted() {
     until("it is received from", || subscription.matched() == [own()]);
     say_to(&socket, &after_loss(8, LENGTH, u64::MAX));
     say_to(&socket, &after_loss(12, LENGTH, u64::MAX));
-    // The number cannot be, either: this sample is refused.
+    // The number is impossible, too: this sample is refused.
     say_to(&socket, &after_loss(1 << 63, LENGTH, u64::MAX));
     say_to(&socket, &after_loss(13, LENGTH, u64::MAX));
     let mut bytes = Vec::new();
@@ -135,7 +135,7 @@ fn losses_that_cannot_be_are_not_counted() {
         assert_eq!(sample.sequence, number);
     }
     until("the refused sample's count", || dropped(&host, "ring") == 1);
-    // No more than there are numbers missing.
+    // At most as many as numbers are missing.
     assert_eq!(dropped(&host, "queue"), 10);
     assert_eq!(relays(&host.status().unwrap())[0].lost, 11);
     assert_eq!(subscription.lost(), 3);

@@ -103,7 +103,7 @@ fn without_a_daemon_to_be_relayed_by_it_is_an_error() {
     assert!(alone.wait_graph(PATIENCE, |graph| graph.endpoints.len() == 2));
 }
 
-/// Stands between sessions and their daemon, and keeps descriptors back.
+/// Forwards packets between sessions and their daemon without descriptors.
 fn keep_descriptors_back(listener: &OwnedFd, daemon: &Address, end: &AtomicBool) {
     let mut pairs: Vec<[OwnedFd; 2]> = Vec::new();
     while !end.load(Ordering::Relaxed) {
@@ -116,11 +116,12 @@ fn keep_descriptors_back(listener: &OwnedFd, daemon: &Address, end: &AtomicBool)
     }
 }
 
-/// Passes packets on as they are, a session's key too. Whether the connection goes on.
+/// Forwards packets unchanged, including a session's key. Returns whether the connection is still
+/// open.
 fn pass_on(from: &OwnedFd, to: &OwnedFd) -> bool {
     let mut packet = vec![0; 1 << 20];
     for _ in 0..16 {
-        // Without room for descriptors: the system closes them.
+        // Without space for descriptors, so that the system closes them.
         match rustix::net::recv(from, &mut packet[..], RecvFlags::DONTWAIT) {
             Ok((0, _)) => return false,
             Ok((length, _)) => {

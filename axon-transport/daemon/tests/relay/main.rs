@@ -1,4 +1,4 @@
-//! Sessions that share no memory, beside those that do.
+//! Sessions that share no memory, together with sessions that do.
 
 mod backlog;
 mod calls_killed;
@@ -47,7 +47,7 @@ use hostile::{say_to, stop};
 use rustix::process::Signal;
 use support::{Host, Kept, PATIENCE, of_child, say, signal, until, wait_for_the_end};
 
-/// Around each border of how samples are kept and carried, and an image.
+/// Lengths around each limit at which samples are stored or carried in another way, and an image.
 const SIZES: [usize; 10] = [0, 1, 96, 97, 4096, 4097, 31 << 10, 32 << 10, 64 << 10, 25_000_000];
 
 fn spec(topic: &str, qos: Qos) -> EndpointSpec {
@@ -62,35 +62,35 @@ fn latched(depth: u32) -> Qos {
     Qos::default().with_durability(Durability::TransientLocal).with_depth(depth)
 }
 
-/// Who shares memory with its daemon, of the two ends of what is tested.
+/// For both ends of a test: true if the end shares memory with its daemon.
 const ENDS: [(bool, bool); 3] = [(false, true), (true, false), (false, false)];
 
-/// Its publishers keep little, so that what lies in between is soon full.
+/// A host whose publishers keep little, so that the buffers on the way are soon full.
 fn host() -> Host {
     Host::new().with("AXON_RING_BUFFER_SIZE_MB", "4")
 }
 
-/// A session that shares memory with the daemon of `host`, or does not.
+/// Opens a session that shares memory with the daemon of `host`, or does not.
 fn session(host: &Host, name: &str, shm: bool) -> Session {
     let mut config = host.config();
     (config.daemon, config.shm) = (DaemonPolicy::Require, shm);
     Session::open(&config, SessionOptions::new(name)).unwrap()
 }
 
-/// Where processes of this host are relayed. It must outlive what they need of `host`.
+/// Returns a host whose processes are relayed by the daemon of `host`. It must outlive those processes.
 fn relaying(host: &Host) -> Host {
     let relaying = Host { env: host.env.clone(), dir: tempfile::tempdir().unwrap() };
     relaying.with("AXON_SHM", "off").with("AXON_DAEMON", "require")
 }
 
-/// Runs a test with two sessions, for each choice of which of them shares memory.
+/// Runs a test with two sessions, for each choice in [`ENDS`].
 fn with_both_ends(test: impl Fn(&Session, &Session)) {
     let host = host();
     let _daemon = host.daemon();
     between([&host, &host], test);
 }
 
-/// The same of two hosts.
+/// Like [`with_both_ends`], with the sessions on two hosts.
 fn between([here, there]: [&Host; 2], test: impl Fn(&Session, &Session)) {
     for (one, other) in ENDS {
         test(&session(here, "one", one), &session(there, "other", other));
@@ -101,7 +101,7 @@ fn pattern(sequence: u64, len: usize) -> Vec<u8> {
     (0..len as u64).map(|at| (at ^ sequence) as u8).collect()
 }
 
-/// Sends something, however long it is held back: the reader is slow, and this is what KEEP_ALL means.
+/// Sends something, and retries as long as it is held back: the reader is slow, and KEEP_ALL waits.
 fn patiently<T>(mut send: impl FnMut() -> Result<T, PublishError>) -> T {
     let deadline = Instant::now() + PATIENCE;
     loop {
@@ -113,7 +113,7 @@ fn patiently<T>(mut send: impl FnMut() -> Result<T, PublishError>) -> T {
     }
 }
 
-/// Sends one after the other, by its number, until it is held back; how many went.
+/// Sends numbered messages until one is held back. Returns how many were sent.
 fn fill<T>(mut send: impl FnMut(u64) -> Result<T, PublishError>) -> u64 {
     for number in 1..20_000 {
         match send(number) {
@@ -145,12 +145,12 @@ fn await_pair(publisher: &Publisher, subscription: &Subscription) {
     });
 }
 
-/// Opens a publisher's or client's channel to a peer that has heard so many MATCHED.
+/// Opens the channel of a publisher or client to a peer that has received `heard` MATCHED messages.
 fn open_for(publisher: Gid, heard: u64) -> Credit {
     Credit { publisher, bytes: 1000, opens: Some(heard), client: None, done: None }
 }
 
-/// The sequence numbers that are taken until `last`.
+/// Takes samples until `last`, and returns their sequence numbers.
 fn take_until(subscription: &Subscription, last: u64) -> Vec<u64> {
     let (mut taken, mut bytes) = (Vec::new(), Vec::new());
     while taken.last() != Some(&last) {
@@ -165,7 +165,7 @@ fn relays(status: &Status) -> Vec<RelayStatus> {
     status.sessions.iter().filter_map(|s| s.relay.clone()).collect()
 }
 
-/// What the children of the tests do. In a run of the tests themselves it does nothing.
+/// The code of the children of the tests. It does nothing in a run of the tests themselves.
 #[test]
 fn child() {
     let Ok(part) = std::env::var("PLAY") else { return };
@@ -187,7 +187,7 @@ fn child() {
             say("matched");
             wait_for_the_end();
         }
-        // Does nothing but live.
+        // Only stays alive.
         "alive" => {
             let publisher = session.create_publisher(spec("/t", time::automatic_lease())).unwrap();
             say("there");
@@ -214,7 +214,7 @@ fn child() {
             say("complete");
             wait_for_the_end();
         }
-        // Asks and never takes.
+        // Sends requests and never takes a response.
         "asker" => {
             let client = session.create_client(services::service()).unwrap();
             assert!(client.wait_available(PATIENCE));
@@ -260,7 +260,7 @@ fn keep_all_holds_its_publisher_back_and_loses_nothing() {
     with_both_ends(|from, to| {
         let (publisher, subscription) = connect(from, to, "/t", Qos::keep_all());
         let len = 50_000;
-        // As much as all that lies in between may hold is there before the first is taken.
+        // All buffers on the way are full before the first sample is taken.
         let last = fill(|number| publisher.publish(&pattern(number, len)));
         let more = last + 200;
         thread::scope(|scope| {
@@ -288,7 +288,7 @@ fn a_late_joiner_gets_the_history_once() {
         }
         let joiner = one.create_subscription(spec("/t", latched(10))).unwrap();
         await_pair(&publisher, &joiner);
-        // Of a relayed publisher the first of them may still be on their way when it joins.
+        // If the publisher is relayed, its first samples may still be in flight when the subscription joins.
         let history = take_until(&joiner, 5);
         assert!(history.ends_with(&[3, 4, 5]) && history.is_sorted_by(|a, b| a < b), "{history:?}");
         assert!(!from_shares || history.len() == 3, "{history:?}");
@@ -313,12 +313,12 @@ fn a_best_effort_publisher_never_blocks_and_losses_are_counted() {
         let published = 400;
         for sequence in 1..=published {
             assert_eq!(publisher.publish(&pattern(sequence, 50_000)).unwrap(), sequence);
-            // Before its first sample a subscription does not know what there was.
+            // Before its first sample, a subscription does not know which samples came before.
             if sequence == 1 {
                 assert_eq!(take_until(&slow, 1), [1]);
             }
         }
-        // The last ones arrive for certain, and with them the count of those before.
+        // The last samples arrive for certain, and with them the count of losses before.
         let taken = 1 + take_until(&slow, published).len() as u64;
         assert!(taken < published, "nothing was lost that could be counted");
         assert_eq!(taken + slow.lost(), published);
@@ -340,7 +340,7 @@ fn a_sample_that_the_daemon_has_not_taken_is_not_acknowledged() {
     assert!(!publisher.wait_acknowledged(Duration::from_millis(50)));
     signal(daemon.0.id(), Signal::CONT);
     assert!(publisher.wait_acknowledged(PATIENCE));
-    // It is where a subscription finds it that looks now.
+    // The sample is where a subscription finds it right now.
     assert!(subscription.has_data());
     assert_eq!(take_until(&subscription, 2), [1, 2]);
 }
@@ -375,7 +375,7 @@ fn local_samples_stay_in_the_process_and_remote_samples_cross_once() {
     let count = |of: fn(&RelayStatus) -> u64| relays(&host.status().unwrap()).iter().map(of).sum();
     assert_eq!((count(|r| r.samples_in), count(|r| r.samples_out)), (0, 0));
 
-    // Its readers inside and outside get the same.
+    // The readers in the same session and in another one get the same samples.
     let outside = other.create_subscription(spec("/inside", Qos::keep_all())).unwrap();
     await_pair(&publisher, &outside);
     publish(&publisher, &pattern(2, 10));
@@ -403,7 +403,7 @@ fn samples_relayed_for_an_ended_subscription_are_not_lost_for_another() {
     let other = to.create_subscription(spec("/t", Qos::keep_all())).unwrap();
     await_pair(&publisher, &other);
     let last = fill(|number| publisher.publish(&pattern(number, 50_000)));
-    // Whichever of them it is that the daemon takes from.
+    // The daemon takes the samples from one of the two; this covers either case.
     let (ends, stays) = if one.gid() < other.gid() { (one, other) } else { (other, one) };
     drop(ends);
     assert!(take_until(&stays, last).into_iter().eq(1..=last));
@@ -472,9 +472,9 @@ fn the_status_names_relayed_sessions_and_the_reason() {
     assert_eq!(of("relayed").relay.as_ref().unwrap().reason, "AXON_SHM is off");
 }
 
-/// Two hosts that find each other.
+/// Creates two hosts that find each other.
 fn two_hosts() -> [Host; 2] {
-    // Of tests that run at the same time none may find those of another.
+    // Pairs of tests that run at the same time must not find each other.
     static PAIRS: AtomicU32 = AtomicU32::new(1);
     let pair = 2 * PAIRS.fetch_add(1, Ordering::Relaxed);
     let pid = std::process::id();

@@ -1,4 +1,4 @@
-//! Endpoints that the daemon does not take.
+//! Endpoints that the daemon refuses.
 
 use std::collections::BTreeSet;
 

@@ -1,5 +1,5 @@
-//! Services where requests and responses pass through the daemon: which servers and clients see each other,
-//! and which client each response is for.
+//! Services whose requests and responses pass through the daemon: which servers and clients see each other, and which
+//! client gets each response.
 
 use std::collections::HashSet;
 
@@ -10,7 +10,7 @@ use super::*;
 const CLIENTS: usize = 20;
 pub(crate) const CALLS: u64 = 50;
 
-/// Nothing that nobody took yet is passed over.
+/// A service that skips no message that nobody has taken.
 pub(crate) fn service() -> EndpointSpec {
     EndpointSpec::new("/add", "Add", Qos::keep_all())
 }
@@ -47,15 +47,14 @@ pub(crate) fn serve(session: &Session) -> Server {
     session.create_server(service()).unwrap()
 }
 
-/// A client once it counts `server`.
+/// Creates a client, and waits until it counts `server`.
 pub(crate) fn ask(session: &Session, server: &Server) -> Client {
     let client = session.create_client(service()).unwrap();
     until("the client counts the server", || client.servers().contains(&server.gid()));
     client
 }
 
-/// Has a test done with a session that shares memory and with one that does not, beside processes that
-/// are relayed.
+/// Runs a test with a session that shares memory and with one that does not, together with relayed processes.
 fn beside_relayed(name: &str, test: impl Fn(&Session, &Host)) {
     let host = host();
     let _daemon = host.daemon();
@@ -112,7 +111,8 @@ fn a_request_reaches_every_server_and_a_response_only_its_client() {
     let host = host();
     let _daemon = host.daemon();
     let sessions = [true, false, false].map(|shm| session(&host, "any", shm));
-    // Two of each in every process, so that some calls stay there and others cross once or twice.
+    // Two of each kind in every process, so that some calls stay in the process and others pass the daemon once or
+    // twice.
     let twice = || sessions.iter().chain(&sessions);
     let servers: Vec<Server> = twice().map(serve).collect();
     let clients: Vec<Client> =
@@ -175,7 +175,7 @@ fn a_relayed_client_killed_with_pending_responses_leaves_the_server_working() {
         let mut asker = relaying.play("asker");
         assert_eq!(asker.hear(), "asked");
         let mut bytes = Vec::new();
-        // What it has asked may be on its way still, and would die with it.
+        // Its requests may still be in flight, and would be lost with it.
         let requests: Vec<_> = (0..CALLS)
             .map(|_| server.recv_request(&mut bytes, Some(PATIENCE)).expect("a request"))
             .collect();
@@ -229,7 +229,7 @@ fn clients_beyond_the_pair_limit_do_not_match_a_relayed_server() {
     let (here, there) = (session(&host, "servers", false), session(&host, "clients", true));
     let servers: Vec<Server> = (0..33).map(|_| serve(&here)).collect();
     let clients: Vec<Client> = (0..32).map(|_| there.create_client(service()).unwrap()).collect();
-    // Of the pairs that they would make.
+    // The limit applies to the pairs of servers and clients.
     until("as many as may", || clients.iter().map(|c| c.servers().len()).sum::<usize>() == 1024);
     clients.iter().for_each(|client| assert_eq!(client.send_request(b"x").unwrap(), 1));
     let mut missing: usize = 1024;
@@ -245,7 +245,7 @@ fn clients_beyond_the_pair_limit_do_not_match_a_relayed_server() {
         }
         missing == 0
     });
-    // Those who are left have room, once others have gone.
+    // Others have left, so there is room for the remaining ones.
     drop(clients);
     let client = ask(&there, &servers[0]);
     until("it counts all", || client.servers().len() == servers.len());

@@ -1,4 +1,4 @@
-//! A daemon that says what the tests have it say.
+//! A daemon whose messages the tests send.
 
 use axon_transport::{
     ids::DaemonId,
@@ -7,7 +7,7 @@ use axon_transport::{
 
 use super::{hostile::hear, *};
 
-/// A relayed session, and the connection to its daemon, which is simulated.
+/// Creates a relayed session, and the connection on which the test plays its daemon.
 fn simulated(host: &Host) -> (Session, OwnedFd) {
     let (listeners, lock) = Address::of(&host.config()).bind().unwrap().into_parts();
     let session = thread::scope(|scope| {
@@ -36,7 +36,7 @@ fn simulated(host: &Host) -> (Session, OwnedFd) {
     session
 }
 
-/// There is an endpoint outside, of this kind and the same topic as `own`.
+/// Announces an outside endpoint of this kind, with the topic of `own`.
 fn show(socket: &OwnedFd, own: &Endpoint, kind: EndpointKind) -> Gid {
     let number = if kind == EndpointKind::Server { 2 } else { 1 };
     show_as(socket, Gid::new(SessionId([9; 16]), number), own, kind)
@@ -82,7 +82,7 @@ fn a_publisher_removed_and_rematched_at_once_is_opened_again() {
     let outside = show(&socket, subscription.endpoint(), EndpointKind::Publisher);
     matched(&socket, subscription.gid(), &[outside]);
     opened(&socket, outside, None);
-    // What the daemon had sent on of that publisher it has forgotten, and so must the session.
+    // The daemon has forgotten what it had forwarded from that publisher, and the session must forget it, too.
     for _ in 0..3 {
         matched(&socket, subscription.gid(), &[]);
         matched(&socket, subscription.gid(), &[outside]);
@@ -90,8 +90,8 @@ fn a_publisher_removed_and_rematched_at_once_is_opened_again() {
     }
 }
 
-/// Waits until what the session's process has heard of its endpoints has come to all that it may come to
-/// there: a pair that is asked for later stands.
+/// Waits until the session's process has handled all earlier messages about its endpoints: a pair that is requested now
+/// is matched after them.
 fn settle(session: &Session, socket: &OwnedFd) {
     let own = session.create_subscription(spec("/settled", Qos::default())).unwrap();
     announced(socket, own.gid());
@@ -180,7 +180,7 @@ fn samples_that_the_daemon_gave_up_are_not_acknowledged() {
         say_to(&socket, &SessionMessage::Credit(Credit { done: Some(3), ..back }));
         assert!(!publisher.wait_acknowledged(PATIENCE), "two are lost");
         assert_eq!(publisher.given_up(), 2);
-        // The loss is told before the credit, which says that all of them are done with.
+        // The loss is reported before the credit that acknowledges all of them.
         until("nothing is on its way", || publisher.unacknowledged() == 0);
         assert!(publisher.wait_acknowledged(PATIENCE), "it was said once");
     }
@@ -246,7 +246,8 @@ fn a_request_is_sent_once_however_many_servers_it_is_for() {
         assert_eq!((piece.publisher, piece.client), (own.gid(), None));
         assert_eq!(piece.head.unwrap().sequence, number);
     }
-    // To whom it answers, and which it answers, is the server's to say; whose it is, is not.
+    // The server decides which client it answers, and which request; but it cannot answer in the name of another
+    // server.
     let other = Gid::new(SessionId([9; 16]), 7);
     let answer = |server, client, sequence| {
         let head =
@@ -328,7 +329,7 @@ fn a_channel_goes_on_when_one_of_its_readers_ends_and_another_is_matched() {
     drop(one);
     let ended = |m: &SessionMessage| *m == SessionMessage::EndpointGone(Gone { gid: gone });
     assert!(hear(&socket, ended).is_some());
-    // Said before the daemon has heard that: for the daemon the channel has had a reader all along.
+    // Sent before the daemon has received that: for the daemon, the channel had a reader all the time.
     matched(&socket, other.gid(), &[outside]);
     until("it is received from", || other.matched() == [outside]);
     piece(None, rest);

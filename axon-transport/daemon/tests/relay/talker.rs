@@ -1,4 +1,4 @@
-//! A child that publishes until it is killed, and tells in a file how far it came.
+//! A child that publishes until it is killed, and writes its progress to a file.
 
 use std::{
     fs::{self, File},
@@ -16,14 +16,14 @@ fn file(runtime_dir: &str) -> PathBuf {
     PathBuf::from(runtime_dir).with_file_name("talker")
 }
 
-/// In a child: publishes without an end.
+/// In a child: publishes without end.
 pub(super) fn talk(session: &Session) {
     let told = File::create(file(&std::env::var("AXON_RUNTIME_DIR").unwrap())).unwrap();
     let publisher = session.create_publisher(spec("/t", Qos::keep_all())).unwrap();
     assert!(publisher.wait_matched(1, PATIENCE));
     for sequence in 1.. {
         publish(&publisher, &pattern(sequence, len_of(sequence)));
-        // A kill leaves each of the two numbers as it was or as it is.
+        // A kill leaves each of the two numbers either old or new.
         let acknowledged = sequence - publisher.unacknowledged();
         for (number, at) in [(acknowledged, 8), (sequence, 0)] {
             told.write_all_at(&number.to_ne_bytes(), at).unwrap();
@@ -31,9 +31,9 @@ pub(super) fn talk(session: &Session) {
     }
 }
 
-/// Takes the remaining samples of the talker, of which the first hundred were taken, and which is killed. All are
-/// whole, none is missing in between, and those that were acknowledged are there. What was not, and the daemon does
-/// not count, was still in the memory of the killed process.
+/// Takes the remaining samples of the killed talker, of which the first hundred were taken before. Checks that all are
+/// whole and none is missing in between, and that the acknowledged samples are among them. Samples that were not
+/// acknowledged, and that the daemon does not count, were still in the memory of the killed process.
 pub(super) fn take_rest_of_talker(host: &Host, subscription: &Subscription) {
     let mut bytes = Vec::new();
     let mut taken = 100;
@@ -51,6 +51,6 @@ pub(super) fn take_rest_of_talker(host: &Host, subscription: &Subscription) {
         "{published} published, {acknowledged} acknowledged, {taken} taken, {counted} counted"
     );
     assert!(acknowledged <= taken, "{taken} came of {acknowledged} that were acknowledged");
-    // It may have been killed before it told of its last one.
+    // It may have been killed before it recorded its last sample.
     assert!(known <= published + 1, "{known} of {published}");
 }

@@ -1,5 +1,4 @@
-//! Deadlines, leases and lifespans where samples pass through the daemon: each is judged where its endpoint
-//! lives.
+//! Deadlines, leases and lifespans if samples pass through the daemon: each is judged in the process of its endpoint.
 
 use axon_transport::internal::session::from_unix_nanos;
 use axon_transport::{
@@ -19,7 +18,7 @@ fn await_counted(session: &Session, event: &Event) -> CountStatus {
     counted
 }
 
-/// How many publishers are alive, and how many are not.
+/// Returns how many publishers are alive, and how many are not.
 fn alive(event: &Event) -> (u64, u64) {
     let EventStatus::LivelinessChanged(LivelinessChanged { alive, not_alive, .. }) = event.take()
     else {
@@ -100,7 +99,7 @@ fn a_process_that_is_stopped_is_not_alive_beyond_a_relay() {
     }
 }
 
-/// The lease of a process that lives as long as it runs.
+/// A lease that a process keeps as long as it runs.
 pub(crate) fn automatic_lease() -> Qos {
     Qos::default().with_lease(400 * MILLI)
 }
@@ -109,13 +108,13 @@ pub(crate) fn automatic_lease() -> Qos {
 fn a_sample_that_outlived_its_lifespan_is_not_delivered_beyond_a_relay() {
     with_both_ends(|from, to| {
         let mortal = |lifespan| Qos::default().with_lifespan(lifespan);
-        // The wall clock does not matter: by it this one is of 1970.
+        // The wall clock does not matter; by it this sample is from 1970.
         let (publisher, subscription) = connect(from, to, "/long", mortal(3_600_000 * MILLI));
         publisher.publish_at(from_unix_nanos(1_000_000_000), b"new").unwrap();
         let mut bytes = Vec::new();
         let info = subscription.recv(&mut bytes, Some(PATIENCE)).unwrap();
         assert_eq!((info.sequence, &bytes[..]), (1, &b"new"[..]));
-        // The age counts from publication, not from when the relay had it: here it is taken later.
+        // The age counts from publication, not from the arrival at the relay: here the sample is taken later.
         let (publisher, subscription) = connect(from, to, "/short", mortal(300 * MILLI));
         publisher.publish_at(from_unix_nanos(i64::MAX), b"old").unwrap();
         thread::sleep(Duration::from_millis(400));

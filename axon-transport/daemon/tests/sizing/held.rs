@@ -1,4 +1,4 @@
-//! What each process holds of the others.
+//! The resources that each process holds because of the others.
 
 use std::{fs, os::unix::fs::MetadataExt as _};
 
@@ -14,7 +14,7 @@ fn spec(topic: usize) -> EndpointSpec {
     EndpointSpec::new(format!("/topic{topic}"), "test/Bytes", Qos::default())
 }
 
-/// What a process holds, as the system counts it.
+/// The resources of a process, as the system counts them.
 #[derive(Debug, Default)]
 struct Held {
     descriptors: u64,
@@ -59,7 +59,7 @@ impl std::fmt::Display for Held {
     }
 }
 
-/// What each of `processes` does.
+/// The code of each of `processes` processes.
 pub(super) fn play(processes: usize) {
     let config = Config::resolve(std::env::vars_os(), None, &OsFiles).unwrap();
     let session = Session::open(&config, SessionOptions::new("sizing")).unwrap();
@@ -120,8 +120,8 @@ fn a_process_maps_each_other_process_once() {
     // One map for each process, and two descriptors: its doorbell and its pidfd.
     assert_eq!(largest(|held| held.maps), processes);
     assert!(largest(|held| held.descriptors) <= 2 * processes + 24);
-    // What is always there, and a lane of 128 bytes for each publisher that a subscription reads
-    // from, in pieces of 64 KiB.
+    // The memory that always exists, and a lane of 128 bytes for each publisher that a subscription
+    // reads, in units of 64 KiB.
     let lanes = TOPICS as u64 * processes * 128;
     assert!(committed <= processes * ((64 << 10) + lanes).next_multiple_of(64 << 10));
     players.into_iter().for_each(support::Player::finish);

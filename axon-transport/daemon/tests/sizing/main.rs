@@ -1,5 +1,5 @@
-//! What many processes of many endpoints take: what each holds of the others, where each reads from
-//! each ([`held`]), and how soon all know all when they start at once ([`startup`]).
+//! The cost of many processes with many endpoints: what each holds because of the others, if each
+//! reads from each ([`held`]), and how soon all know all if they start at once ([`startup`]).
 //!
 //! In the full size: `SIZING=50 cargo test --release -p axon-daemon --test sizing -- --nocapture`
 #![expect(clippy::print_stdout, reason = "what it prints is its result")]
@@ -10,15 +10,15 @@ mod startup;
 #[allow(dead_code, reason = "what other tests need of it")]
 mod support;
 
-/// Topics: a publisher and a subscription of each process or session for each.
+/// Number of topics. Each process or session has a publisher and a subscription for each.
 const TOPICS: usize = 10;
 
-/// How many processes: `few` in an ordinary run.
+/// Returns the number of processes: `few` in an ordinary run.
 fn size(few: usize) -> usize {
     std::env::var("SIZING").ok().map_or(few, |n| n.parse().unwrap())
 }
 
-/// Not a test of its own: what each of the processes does.
+/// The code of the processes; not a test of its own.
 #[test]
 fn child() {
     let Ok(part) = std::env::var("PLAY") else { return };

@@ -1,5 +1,5 @@
-//! How long many processes that start at once take until each knows all, and again when the daemon
-//! was killed, and what is said and worked for it.
+//! Measures how long many processes that start at once take until each knows all, and again after
+//! the daemon was killed, and the messages and the processor time for that.
 
 use std::{
     fs,
@@ -18,11 +18,11 @@ use axon_transport::{
 };
 use support::{Host, PATIENCE, Player, say, wait_for_the_end};
 
-/// How long they are left alone.
+/// Time for which they are left alone.
 const REST: Duration = Duration::from_secs(2);
-/// Sessions of each process that has topics of its own.
+/// Number of sessions of each process that has its own topics.
 const SESSIONS: usize = 4;
-/// What a ROS 2 node serves, so that others ask for its parameters.
+/// The services of a ROS 2 node, by which other processes query its parameters.
 const SERVICES: [&str; 7] = [
     "describe_parameters",
     "get_parameter_types",
@@ -32,7 +32,7 @@ const SERVICES: [&str; 7] = [
     "set_parameters",
     "set_parameters_atomically",
 ];
-/// The node, these, what each node publishes and subscribes to, and a topic of its own.
+/// The node, its services, the endpoints of each ROS 2 node, and a topic of its own.
 const OF_NODE: usize = 1 + SERVICES.len() + 3 + 2;
 
 fn session() -> Session {
@@ -40,7 +40,7 @@ fn session() -> Session {
     Session::open(&config, SessionOptions::new("sizing")).unwrap()
 }
 
-/// Sessions with endpoints of their own topics, which each shall know `total`.
+/// Opens sessions with endpoints of their own topics; each must come to know `total` endpoints.
 pub(super) fn play_sessions(total: usize) {
     let mut endpoints = Vec::new();
     let mut sessions = Vec::new();
@@ -57,7 +57,7 @@ pub(super) fn play_sessions(total: usize) {
     know_all(&sessions, total, || {});
 }
 
-/// One node as ROS 2 makes it, of as many processes.
+/// Creates one node as ROS 2 does, in one of `processes` processes.
 pub(super) fn play_node(processes: usize) {
     let session = session();
     let name = format!("node{}", std::process::id());
@@ -85,7 +85,8 @@ pub(super) fn play_node(processes: usize) {
     drop((services, topic));
 }
 
-/// Tells when each of the sessions knows `total` endpoints and is `matched`, and when again.
+/// Reports when each session knows `total` endpoints and is `matched`, and when it does again with
+/// another daemon.
 fn know_all(sessions: &[Session], total: usize, matched: impl Fn()) {
     say("created");
     for session in sessions {
@@ -95,13 +96,13 @@ fn know_all(sessions: &[Session], total: usize, matched: impl Fn()) {
     let before: Vec<_> = sessions.iter().map(|s| (s.daemon(), s.graph())).collect();
     say("whole");
     for (session, (daemon, _)) in sessions.iter().zip(&before) {
-        // Not by looking now and then: they are to be at rest.
+        // Without polling, because the processes must be at rest.
         let another = || session.daemon().is_some_and(|now| Some(now) != *daemon);
         assert!(session.wait_graph(PATIENCE, |_| another()));
     }
     say("found");
     for (session, (_, before)) in sessions.iter().zip(&before) {
-        // Each of them was told of by the new one.
+        // The new daemon reported each of them again.
         let anew = |(gid, entry): (&Gid, &GraphEntry)| {
             !before
                 .endpoints
@@ -117,11 +118,11 @@ fn know_all(sessions: &[Session], total: usize, matched: impl Fn()) {
     wait_for_the_end();
 }
 
-/// Seconds of the processor that the threads of a process have had.
+/// Returns the processor time in seconds that the threads of a process have used.
 fn processor(pid: u32) -> f64 {
     let tasks = fs::read_dir(format!("/proc/{pid}/task")).unwrap();
     let nanoseconds = tasks.map(|task| {
-        // One that ends meanwhile has none.
+        // A thread that ends meanwhile has none.
         let path = task.unwrap().path().join("schedstat");
         let text = fs::read_to_string(path).unwrap_or_default();
         text.split(' ').next().and_then(|run| run.parse::<u64>().ok()).unwrap_or(0)
@@ -133,7 +134,7 @@ fn processor_of_all(players: &[Player]) -> f64 {
     players.iter().map(|player| processor(player.pid())).sum()
 }
 
-/// Memory of a process that it shares with no other, in KiB.
+/// Returns the private memory of a process in KiB.
 fn private(pid: u32) -> u64 {
     let rollup = fs::read_to_string(format!("/proc/{pid}/smaps_rollup")).unwrap();
     let of = |name: &str| {
@@ -143,29 +144,29 @@ fn private(pid: u32) -> u64 {
     of("Private_Clean:") + of("Private_Dirty:")
 }
 
-/// Descriptors of a process.
+/// Returns the number of descriptors of a process.
 fn descriptors(pid: u32) -> usize {
     fs::read_dir(format!("/proc/{pid}/fd")).unwrap().count()
 }
 
-/// What it took until all knew all, and what they hold then and do.
+/// The cost until all knew all, and the resources and the load after that.
 struct Whole {
-    /// Until all knew all.
+    /// Time until all knew all.
     time: Duration,
-    /// Seconds of the processor until then: of the daemon, and of the others.
+    /// Processor time in seconds until then: of the daemon, and of the others.
     processor: [f64; 2],
     traffic: TrafficStatus,
-    /// KiB that are nobody else's: of the daemon, and the most that another has.
+    /// Private memory in KiB: of the daemon, and the largest of the others.
     memory: [u64; 2],
-    /// The same of descriptors.
+    /// Number of descriptors: of the daemon, and the largest of the others.
     descriptors: [usize; 2],
-    /// Of one processor, while nothing happens: the daemon, and all others together.
+    /// Share of one processor while nothing happens: of the daemon, and of all others together.
     at_rest: [f64; 2],
 }
 
 impl Whole {
-    /// Of players that know all, `time` after what made them look, when the others had had `before`
-    /// seconds of the processor.
+    /// Measures players that know all, `time` after the event that started it. `before` is the
+    /// processor time of the others at that event.
     fn look(host: &Host, players: &[Player], time: Duration, before: f64) -> Self {
         let daemon = host.status().unwrap();
         let worked = || [processor(daemon.pid), processor_of_all(players)];
@@ -189,7 +190,7 @@ impl Whole {
     }
 }
 
-/// A table of both.
+/// Prints a table of both.
 fn print(start: &Whole, again: &Whole) {
     let row = |name: &str, of: &dyn Fn(&Whole) -> String| {
         println!("| {name:<38} | {:>9} | {:>9} |", of(start), of(again));
@@ -210,7 +211,7 @@ fn print(start: &Whole, again: &Whole) {
     row("all others at rest", &|whole| format!("{:.2} %", whole.at_rest[1]));
 }
 
-/// Starts `processes` that each play `part`, and kills the daemon once all know all.
+/// Starts `processes` processes that play `part`, and kills the daemon once all know all.
 fn measure(processes: usize, part: &str) {
     let host = Host::new().with("AXON_LOG", "warn");
     let mut daemon = host.daemon();
@@ -226,7 +227,7 @@ fn measure(processes: usize, part: &str) {
     let before = processor_of_all(&players);
     daemon.0.kill().unwrap();
     daemon.0.wait().unwrap();
-    // One of them starts the next.
+    // One of them starts the next daemon.
     let killed = Instant::now();
     let found = all(&mut players, "found");
     let whole_again = all(&mut players, "whole again");

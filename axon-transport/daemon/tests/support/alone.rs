@@ -5,7 +5,7 @@ use axon_transport::{
     config::{Config, DaemonPolicy},
 };
 
-/// A session that has its process to itself.
+/// Opens a session in this process without a daemon.
 pub(crate) fn alone() -> Session {
     let config = Config::builder().daemon(DaemonPolicy::Off).build().unwrap();
     Session::open(&config, SessionOptions::new("test")).unwrap()

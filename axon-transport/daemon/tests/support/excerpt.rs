@@ -1,16 +1,16 @@
-//! What a test that failed shows of a long text, a log or what a compiler says: its end, and the first
-//! warnings before. All of it is kept in a file.
+//! Excerpts of a long text (a log, or a compiler's output) for the message of a failed test: its end, and the first
+//! warnings before that. The whole text is kept in a file.
 
 use std::{fs, path::Path, thread};
 
-/// Lines of the end that are shown.
+/// Number of lines at the end that are shown.
 const END: usize = 100;
-/// Warnings and errors before these that are shown.
+/// Number of warnings and errors before these that are shown.
 const WARNINGS: usize = 10;
-/// Characters of a line that are shown.
+/// Number of characters of a line that are shown.
 const LINE: usize = 500;
 
-/// What is shown of `text` under `name`.
+/// Returns the excerpt of `text`, which is kept under `name`.
 pub(crate) fn excerpt(name: &str, text: &str) -> String {
     let lines: Vec<&str> = text.lines().collect();
     let (before, end) = lines.split_at(lines.len().saturating_sub(END));
@@ -36,7 +36,7 @@ pub(crate) fn excerpt(name: &str, text: &str) -> String {
     format!("--- {name}: {kept}\n{first}the last {} lines:\n{}", end.len(), end.join("\n"))
 }
 
-/// Keeps a text under the running test's name, in place of what an earlier run of it left.
+/// Keeps a text under the running test's name. Replaces the text of an earlier run.
 fn keep(name: &str, text: &str) -> std::io::Result<String> {
     let test = thread::current().name().unwrap_or("unnamed").replace("::", "-");
     let name = name.replace(|c: char| !c.is_alphanumeric(), "-");

@@ -1,15 +1,16 @@
-//! A control group with little memory, where one may be made.
+//! A control group with little memory, if one can be created.
 
 use std::{
     fs,
     path::{Path, PathBuf},
 };
 
-/// Removed when dropped, by when it must be empty.
+/// A control group. Dropping it removes it; it must be empty by then.
 pub(crate) struct Group(PathBuf);
 
 impl Group {
-    /// A group whose processes may have `bytes` of memory; or why there can be none.
+    /// Creates a group whose processes may have `bytes` of memory. Returns the reason if that is
+    /// not possible.
     pub(crate) fn new(bytes: u64) -> Result<Self, String> {
         let name = format!("axon-test-{}", std::process::id());
         let of = |root: &str, limit: &str| {
@@ -27,7 +28,7 @@ impl Group {
         }
     }
 
-    /// Its directory.
+    /// Returns its directory.
     pub(crate) fn path(&self) -> &Path {
         &self.0
     }
@@ -39,7 +40,7 @@ impl Drop for Group {
     }
 }
 
-/// Moves the calling process to the group of this directory.
+/// Moves the calling process to the group with this directory.
 pub(crate) fn join(group: &Path) -> std::io::Result<()> {
     fs::write(group.join("cgroup.procs"), std::process::id().to_string())
 }

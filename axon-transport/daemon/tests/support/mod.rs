@@ -1,5 +1,5 @@
-//! A host of its own for each test: a runtime directory, a daemon binary, and child processes that
-//! play applications. A child is this very test program, told by `PLAY` what to do.
+//! A host for each test: a runtime directory, a daemon binary, and child processes that play applications. A child is
+//! this test program itself; the variable `PLAY` names its part.
 
 pub(crate) mod excerpt;
 mod kept;
@@ -22,9 +22,9 @@ use axon_transport::{
 
 pub(crate) use kept::Kept;
 
-/// Long enough for a loaded machine; a test that works never waits for it.
+/// Long enough for a loaded machine. A test that works never waits this long.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
-/// What a child's lines to its test begin with.
+/// The beginning of each line from a child to its test.
 const MARK: &str = "## ";
 
 pub(crate) struct Host {
@@ -40,7 +40,7 @@ impl Host {
             ("AXON_RUNTIME_DIR", run.to_str().unwrap()),
             ("AXON_DAEMON_PATH", env!("CARGO_BIN_EXE_axon_daemon")),
             ("AXON_BIND_ADDRS", "127.0.0.1"),
-            // Hosts of other tests are on the same loopback.
+            // Hosts of other tests are on the same loopback interface.
             ("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
             ("AXON_LOG", "debug"),
         ];
@@ -60,7 +60,7 @@ impl Host {
         self
     }
 
-    /// The configuration that its processes read, for this very process.
+    /// Returns, for this process, the configuration that its processes read.
     pub(crate) fn config(&self) -> Config {
         self.try_config().unwrap()
     }
@@ -70,7 +70,7 @@ impl Host {
         Config::resolve(env, None, &OsFiles)
     }
 
-    /// A session in this process with the daemon that runs. It starts none, which would outlive the test.
+    /// Opens a session in this process with the running daemon. It starts no daemon, which would outlive the test.
     pub(crate) fn session(&self, name: &str) -> Result<Session, SessionError> {
         let mut config = self.config();
         config.daemon = DaemonPolicy::Require;
@@ -91,12 +91,12 @@ impl Host {
         command
     }
 
-    /// A daemon in the foreground, once it answers.
+    /// Starts a daemon in the foreground, and waits until it answers.
     pub(crate) fn daemon(&self) -> Kept {
         self.daemon_by(self.command(env!("CARGO_BIN_EXE_axon_daemon")))
     }
 
-    /// The same, where `command` is the daemon, or becomes it.
+    /// Like [`daemon`](Self::daemon); `command` is the daemon, or executes it.
     pub(crate) fn daemon_by(&self, mut command: Command) -> Kept {
         let log = fs::OpenOptions::new().create(true).append(true).open(self.log()).unwrap();
         let kept = Kept(command.stderr(log).spawn().unwrap());
@@ -104,17 +104,17 @@ impl Host {
         kept
     }
 
-    /// What daemons in the foreground log.
+    /// Returns the log file of daemons in the foreground.
     pub(crate) fn log(&self) -> std::path::PathBuf {
         self.dir.path().join("daemon.txt")
     }
 
-    /// A child that plays `part`.
+    /// Starts a child that plays `part`.
     pub(crate) fn play(&self, part: &str) -> Player {
         self.play_in(self.command(std::env::current_exe().unwrap()), part)
     }
 
-    /// The same, where `command` is this program, or runs the one that its arguments end with.
+    /// Like [`play`](Self::play); `command` is this program, or runs the program at the end of its arguments.
     pub(crate) fn play_in(&self, mut command: Command, part: &str) -> Player {
         command.args(["child", "--exact", "--nocapture", "--test-threads=1"]).env("PLAY", part);
         let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
@@ -150,7 +150,7 @@ pub(crate) struct Player {
 }
 
 impl Player {
-    /// The child's next line.
+    /// Returns the child's next line.
     pub(crate) fn hear(&mut self) -> String {
         loop {
             let line =
@@ -162,7 +162,7 @@ impl Player {
         }
     }
 
-    /// As [`finish`](Self::finish), and it says nothing more.
+    /// Like [`finish`](Self::finish), and checks that the child writes nothing more.
     #[allow(dead_code, reason = "not every test needs it")]
     pub(crate) fn finish_silently(mut self) {
         drop(self.child.0.stdin.take());
@@ -171,7 +171,7 @@ impl Player {
         self.finish();
     }
 
-    /// As [`finish`](Self::finish); all that it still writes.
+    /// Like [`finish`](Self::finish), and returns everything that the child still writes.
     #[allow(dead_code, reason = "not every test needs it")]
     pub(crate) fn finish_and_tell(mut self) -> Vec<String> {
         drop(self.child.0.stdin.take());
@@ -184,14 +184,14 @@ impl Player {
         self.child.0.id()
     }
 
-    /// Tells it to go on.
+    /// Tells the child to go on.
     #[allow(dead_code, reason = "not every test needs it")]
     pub(crate) fn go(&mut self) {
         let mut stdin = self.child.0.stdin.as_ref().expect("its input");
         stdin.write_all(b"go\n").unwrap();
     }
 
-    /// Closes its standard input, on which it waits, and waits for its end.
+    /// Closes the child's standard input, on which it waits, and waits for its end.
     pub(crate) fn finish(mut self) {
         drop(self.child.0.stdin.take());
         let status = self.child.0.wait().unwrap();
@@ -199,31 +199,31 @@ impl Player {
     }
 }
 
-/// Says something to the test, in a child.
+/// In a child: sends a line to the test.
 #[allow(clippy::print_stdout)]
 pub(crate) fn say(text: impl std::fmt::Display) {
     println!("{MARK}{text}");
 }
 
-/// The session of a child, which starts a daemon where there is none and the test lets it.
+/// In a child: opens a session, which starts a daemon if there is none and the test permits it.
 #[allow(dead_code, reason = "not every test needs it")]
 pub(crate) fn of_child(name: &str) -> Session {
     Session::open(&Config::from_env().unwrap(), SessionOptions::new(name)).unwrap()
 }
 
-/// Waits for the test, in a child.
+/// In a child: waits until the test ends it.
 pub(crate) fn wait_for_the_end() {
     let mut line = String::new();
     while std::io::stdin().read_line(&mut line).unwrap() > 0 {}
 }
 
-/// Waits for something that must come.
+/// Waits for a condition that must come true.
 #[track_caller]
 pub(crate) fn until(what: &str, reached: impl FnMut() -> bool) {
     until_within(PATIENCE, what, reached);
 }
 
-/// As [`until`], for what is so much work that a loaded machine needs longer.
+/// Like [`until`], for a condition that takes longer than that on a loaded machine.
 #[track_caller]
 pub(crate) fn until_within(limit: Duration, what: &str, mut reached: impl FnMut() -> bool) {
     let deadline = Instant::now() + limit;
@@ -237,7 +237,7 @@ pub(crate) fn signal(pid: u32, signal: rustix::process::Signal) {
     try_signal(pid, signal).unwrap();
 }
 
-/// To a process that may end at any time.
+/// Sends a signal to a process that may end at any time.
 fn try_signal(pid: u32, signal: rustix::process::Signal) -> rustix::io::Result<()> {
     let pid = rustix::process::Pid::from_raw(i32::try_from(pid).unwrap()).unwrap();
     rustix::process::kill_process(pid, signal)

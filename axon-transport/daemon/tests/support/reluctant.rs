@@ -1,4 +1,4 @@
-//! Descriptors whose closing takes as long as their sender likes.
+//! Descriptors whose close takes as long as their sender wants.
 
 use std::{
     fs::File,
@@ -14,7 +14,8 @@ use rustix::net::{
     sendmsg, socketpair, sockopt,
 };
 
-/// A socket whose last close takes hours, since it lingers over what its peer does not read.
+/// Creates a socket whose last close takes hours, because it lingers over data that its peer does
+/// not read.
 fn reluctant() -> (OwnedFd, TcpStream) {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     sockopt::set_socket_recv_buffer_size(&listener, 4096).unwrap();
@@ -27,7 +28,8 @@ fn reluctant() -> (OwnedFd, TcpStream) {
     (ours.into(), peer)
 }
 
-/// A unix socket whose queue holds a packet with such a socket. Closing the unix socket closes it.
+/// Creates a unix socket whose queue holds a packet with such a socket. Closing the unix socket
+/// closes it.
 pub(crate) fn hiding() -> (OwnedFd, TcpStream) {
     let (unix, packets) = (AddressFamily::UNIX, SocketType::SEQPACKET);
     let (ours, theirs) = socketpair(unix, packets, SocketFlags::CLOEXEC, None).unwrap();
@@ -36,7 +38,7 @@ pub(crate) fn hiding() -> (OwnedFd, TcpStream) {
     (ours, peer)
 }
 
-/// A packet whose last descriptor is from then on in nobody's hands but the receiver's.
+/// Sends a packet. After that, only the receiver has a reference to its last descriptor.
 pub(crate) fn send_away(socket: &OwnedFd, bytes: &[u8], before: usize, fd: OwnedFd) {
     let null: OwnedFd = File::open("/dev/null").unwrap().into();
     let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(8))];

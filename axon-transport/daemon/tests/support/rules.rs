@@ -1,18 +1,18 @@
-//! ROS 2's rules by which a publisher and a subscription go together, written down a second time for
-//! the models of tests. What decides here asks nothing of what is tested: it is the table of ROS 2's
-//! documentation ("About Quality of Service settings"), a line a policy.
+//! ROS 2's rules for the compatibility of a publisher and a subscription, written a second time for the models of
+//! tests. They use no code under test: they are the table of ROS 2's documentation ("About Quality of Service
+//! settings"), one line per policy.
 
 use std::{collections::BTreeSet, time::Duration};
 
 use axon_transport::qos::{Durability, History, Liveliness, Qos, Reliability};
 use serde::{Deserialize, Serialize};
 
-/// A quality of service. Times are in seconds, `None` is infinite.
+/// A quality of service. Times are in seconds; `None` is infinite.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Profile {
     pub(crate) reliable: bool,
     pub(crate) transient_local: bool,
-    /// KEEP_LAST's; `None` is KEEP_ALL.
+    /// The depth of KEEP_LAST; `None` is KEEP_ALL.
     pub(crate) depth: Option<u32>,
     pub(crate) deadline: Option<u64>,
     pub(crate) manual: bool,
@@ -21,7 +21,7 @@ pub(crate) struct Profile {
 }
 
 impl Default for Profile {
-    /// ROS 2's default: RELIABLE, VOLATILE, KEEP_LAST(10).
+    /// Returns ROS 2's default: RELIABLE, VOLATILE, KEEP_LAST(10).
     fn default() -> Self {
         let (deadline, lease, lifespan) = (None, None, None);
         let (reliable, transient_local, depth, manual) = (true, false, Some(10), false);
@@ -29,14 +29,15 @@ impl Default for Profile {
     }
 }
 
-/// The policies that can keep two endpoints apart, as ROS 2 spells them.
+/// The policies that can make two endpoints incompatible, as ROS 2 spells them.
 pub(crate) const POLICIES: [&str; 5] =
     ["RELIABILITY", "DURABILITY", "DEADLINE", "LIVELINESS", "LIVELINESS_LEASE_DURATION"];
 
 impl Profile {
-    /// Why a publisher of this profile does not serve a subscription of that one.
+    /// Returns the policies because of which a publisher of this profile does not serve a subscription that requests
+    /// `wanted`.
     pub(crate) fn falls_short_of(&self, wanted: &Self) -> BTreeSet<String> {
-        // A period that is offered must not be longer than the one that is wanted.
+        // An offered period must not be longer than the requested one.
         let longer = |offered: Option<u64>, wanted: Option<u64>| match (offered, wanted) {
             (_, None) => false,
             (None, Some(_)) => true,
@@ -53,7 +54,7 @@ impl Profile {
         policies.map(|(policy, _)| (*policy).to_owned()).collect()
     }
 
-    /// As an endpoint is made with it.
+    /// Converts the profile to the QoS of an endpoint.
     pub(crate) fn qos(&self) -> Qos {
         let period = |seconds: Option<u64>| seconds.map(Duration::from_secs);
         let liveliness =
@@ -77,7 +78,7 @@ impl Profile {
         .with_liveliness(liveliness, period(self.lease))
     }
 
-    /// As an endpoint says it is. `None` where it is nothing that [`qos`](Self::qos) makes.
+    /// Converts the QoS of an endpoint to a profile. Returns `None` if [`qos`](Self::qos) makes no such QoS.
     #[allow(dead_code, reason = "not every test looks at others' profiles")]
     pub(crate) fn of(qos: &Qos) -> Option<Self> {
         let seconds = |period: Option<Duration>| period.map(|period| period.as_secs());
@@ -94,7 +95,7 @@ impl Profile {
     }
 }
 
-/// Whether two endpoints of a topic mean the same type: by its name, and by its hash where both know it.
+/// Returns whether two endpoints of a topic have the same type: the same name, and the same hash if both know it.
 pub(crate) fn same_type(one: (&str, &[u8]), other: (&str, &[u8])) -> bool {
     one.0 == other.0 && (one.1 == other.1 || one.1.is_empty() || other.1.is_empty())
 }

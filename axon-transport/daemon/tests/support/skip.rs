@@ -1,8 +1,8 @@
-//! What cannot be tried here is not passed over in silence.
+//! Reports tests that cannot run here.
 
 use std::{fmt::Display, io::Write as _};
 
-/// Says why, past the harness, which would show it only beside a failure.
+/// Prints the reason directly: the harness would show it only for a failed test.
 pub(crate) fn skip(why: impl Display) {
     let _ = writeln!(std::io::stderr(), "skipped: {why}");
 }

@@ -1,25 +1,30 @@
-//! Processes publish to each other and call each other while some of them are killed, stopped and continued at
-//! random, and the daemon is killed under them. Publishers, and processes, end 0.3 to 1 s after another process was
-//! continued. One process of three is in a PID namespace of its own, with the outer or a new `/proc`, where the
-//! machine allows that: the first line of output says where it does not.
+//! Processes publish to each other and call each other. Meanwhile processes are killed, stopped and continued at
+//! random, and the daemon is killed. Publishers, and processes, end 0.3 to 1 s after another process was continued. One
+//! process of three is in its own PID namespace, with the outer or a new `/proc`, if the machine permits that;
+//! otherwise the first line of output says so.
 //!
-//! Samples are of 0 bytes to 25 MB and carry their number and a pattern of it. Some are published through loans that
-//! are held while other samples go out; readers hold some. What must hold: every sample is whole; a KEEP_ALL
-//! subscription misses none of a publisher that lives, repeats none of any, takes all of one that ended, and what it
-//! misses of one that was killed, or that ended around a daemon's kill, it counts, that of a publisher included which
-//! it was never told of; every call is seen once by each server, and answered once by each that lives; no process fails
-//! or stands still; the memory they hold together stays below a ceiling. At the end the disturbances cease, every
-//! process must come to have the last sample of every other, and every call its answers.
-//! When something is missing, both processes print the history of the pair.
+//! Samples have 0 bytes to 25 MB and carry their number and a pattern of it. Some are published through loans that are
+//! held while other samples go out; readers hold some samples. The test checks:
 //!
-//! There are three plans. `Brief`: eight processes, stopped for some tenths of a second, often. `Stops`: twelve, stopped
-//! for one to four seconds, while the daemon is killed. `Ends`: the same twelve, and the daemon lives: there no reader may
-//! miss anything of a publisher that ended by itself, counted or not.
+//! - Every sample is whole.
+//! - A KEEP_ALL subscription misses no sample of a living publisher, repeats none of any publisher, and takes all of
+//!   one that ended. It counts the samples that it misses of a publisher that was killed, or that ended around a
+//!   daemon's kill, even if it was never told of that publisher.
+//! - Each server sees every call once, and each living server answers it once.
+//! - No process fails or gets stuck.
+//! - The memory that the processes hold together stays below a ceiling.
 //!
-//! One round of some seconds of each by default. For longer, `cargo test --release -p axon-daemon
-//! --test torture -- --minutes 60`: rounds of half a minute, each of another seed, and a line of a table
-//! for each. The plans take turns; `--stops` leaves the first one out. `--seed N` begins with that one: the same
-//! disturbances again, though not the same moments.
+//! At the end the disturbances cease. Then every process must get the last sample of every other, and every call its
+//! answers. If something is missing, both processes print the history of the pair.
+//!
+//! There are three plans. `Brief`: eight processes are often stopped for some tenths of a second. `Stops`: twelve are
+//! stopped for one to four seconds, while the daemon is killed. `Ends`: the same twelve, but the daemon lives; no
+//! reader may miss a sample of a publisher that ended by itself, whether counted or not.
+//!
+//! By default, each plan runs one round of some seconds. For longer, `cargo test --release -p axon-daemon --test
+//! torture -- --minutes 60` runs rounds of half a minute, each with another seed, and prints a line of a table for
+//! each. The plans take turns; `--stops` leaves the first one out. `--seed N` begins with that seed: it gives the same
+//! disturbances again, but not at the same moments.
 #![expect(clippy::print_stdout, reason = "what it prints is its result")]
 
 mod child;
@@ -35,15 +40,15 @@ use std::{
 
 use conductor::{Namespaces, Plan, Round};
 
-/// How long the processes are disturbed in an ordinary run, by each plan.
+/// Time for which the processes are disturbed in an ordinary run, by plan.
 const SHORT: [(Plan, Duration); 3] = [
     (Plan::Brief, Duration::from_secs(6)),
     (Plan::Stops, Duration::from_secs(12)),
     (Plan::Ends, Duration::from_secs(8)),
 ];
-/// The plans of a long run, in turn; the first is left out with `--stops`.
+/// The plans of a long run, in turn; `--stops` leaves the first one out.
 const PLANS: [Plan; 3] = [Plan::Brief, Plan::Stops, Plan::Ends];
-/// The same of each round of a long run.
+/// Time for which the processes are disturbed in each round of a long run.
 const LONG: Duration = Duration::from_secs(25);
 
 fn main() -> ExitCode {

@@ -1,4 +1,4 @@
-//! What a process did about its pairs, kept in memory: printed when one of them lost something.
+//! The history of a process's pairs, kept in memory, and printed when one of them lost something.
 #![expect(clippy::print_stderr, reason = "it is for people who look for a cause")]
 
 use std::{
@@ -9,16 +9,16 @@ use std::{
 
 use tracing_subscriber::{EnvFilter, fmt::MakeWriter};
 
-/// Lines that are kept.
+/// Number of lines that are kept.
 const LINES: usize = 50_000;
-/// What of the library's log belongs to the log of pairs: pairs, and the daemons that come and go.
+/// The part of the library's log that the log of pairs keeps: pairs, and the daemons that come and go.
 const FILTER: &str = "axon_transport::pairs=debug,axon_transport::session=debug";
 
 #[derive(Clone, Default)]
 pub(crate) struct PairLog(Arc<Mutex<VecDeque<String>>>);
 
 impl PairLog {
-    /// Keeps what the library logs from now on.
+    /// Keeps the library's log from now on.
     pub(crate) fn keep() -> Self {
         let pair_log = Self::default();
         let subscriber = tracing_subscriber::fmt()
@@ -33,7 +33,7 @@ impl PairLog {
         tracing::debug!(target: "axon_transport::pairs", "{line}");
     }
 
-    /// Prints what concerns a reader or writer, and all that concerns no pair.
+    /// Prints the lines about a reader or writer, and the lines about no pair.
     pub(crate) fn print(&self, gid: &str) {
         let of_pairs = |line: &str| line.contains("axon_transport::pairs");
         let lines = self.lines();
@@ -42,8 +42,8 @@ impl PairLog {
         eprintln!("--- process {}, {gid}:\n{lines}", std::process::id());
     }
 
-    /// How many samples the library counted as lost of publishers that ended before this process was told of their grant
-    /// to `reader`, in all or of `writer` alone; `None` if there were none.
+    /// Returns how many samples the library counted as lost of publishers that ended before this process was told of
+    /// their grant to `reader`: of all publishers, or of `writer` alone. Returns `None` if there were none.
     pub(crate) fn unmet(&self, reader: &str, writer: Option<&str>) -> Option<u64> {
         let reader = format!("reader={reader} ");
         let writer = writer.map(|writer| format!("writer={writer} ")).unwrap_or_default();
@@ -66,7 +66,7 @@ impl io::Write for PairLog {
         if lines.len() == LINES {
             lines.pop_front();
         }
-        // The library's log is written an event at a time.
+        // The library writes its log one event at a time.
         lines.push_back(String::from_utf8_lossy(bytes).into_owned());
         Ok(bytes.len())
     }

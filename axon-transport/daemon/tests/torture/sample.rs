@@ -1,11 +1,11 @@
-//! Samples that say who they are, byte by byte.
+//! Samples that identify themselves in each byte.
 
-/// The longest.
+/// The length of the longest sample in bytes.
 pub(crate) const LONGEST: usize = 25_000_000;
-/// Of so many samples one may be as long as that.
+/// One of this many samples may be as long as that.
 const RARITY: u64 = 50;
 
-/// Numbers that follow from a seed (splitmix64).
+/// Pseudo-random numbers that follow from a seed (splitmix64).
 pub(crate) struct Random(pub(crate) u64);
 
 impl Random {
@@ -21,7 +21,8 @@ impl Random {
         self.next() % bound
     }
 
-    /// 0 to 8 MiB, each power of two as often as the next, or now and then up to [`LONGEST`].
+    /// Returns a length of 0 to 8 MiB, each power of two being equally likely, or now and then up
+    /// to [`LONGEST`].
     pub(crate) fn length(&mut self) -> usize {
         let power = self.below(25);
         let most = match power {
@@ -33,7 +34,8 @@ impl Random {
     }
 }
 
-/// The pattern's word at `index` of the sample `sequence` of the publisher whose GID begins so.
+/// Returns the word at `index` of the pattern of sample `sequence`, for the publisher whose GID
+/// begins with `publisher`.
 fn word(publisher: u64, sequence: u64, index: u64) -> u64 {
     (publisher ^ sequence.rotate_left(32)).wrapping_add(index.wrapping_mul(0x9e37_79b9_7f4a_7c15))
 }
@@ -47,7 +49,8 @@ pub(crate) fn fill(publisher: u64, sequence: u64, out: &mut [u8]) {
     }
 }
 
-/// Whether `bytes`, which begin at byte `at`, a multiple of 8, are those of the sample.
+/// Returns whether `bytes`, from byte `at` of the sample on, match its pattern. `at` is a multiple
+/// of 8.
 pub(crate) fn is_whole(publisher: u64, sequence: u64, at: usize, bytes: &[u8]) -> bool {
     let (words, rest) = bytes.as_chunks::<8>();
     let first = at as u64 / 8;

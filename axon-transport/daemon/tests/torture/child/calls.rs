@@ -11,22 +11,22 @@ use axon_transport::{Client, Server, ids::Gid};
 use super::{Child, Kind, PATIENCE, hex, publishing::is_for_now, stamp};
 use crate::sample::{Random, fill, is_whole};
 
-/// Calls that a server has not answered yet, at most.
+/// Maximum number of calls that a server has not answered yet.
 const IN_FLIGHT: usize = 8;
-/// Time between two calls at most, in milliseconds.
+/// Maximum time between two calls in milliseconds.
 const PAUSE_MS: u64 = 200;
-/// Length of a request at most, as a power of two.
+/// Maximum length of a request, as a power of two.
 const LONGEST_POWER: u64 = 18;
 
 /// The calls that servers have not answered.
 #[derive(Default)]
 pub(super) struct Calls {
-    /// By server: one that was there when a call was sent has to answer it.
+    /// The calls by server. A server that existed when a call was sent has to answer it.
     due: Mutex<HashMap<Gid, VecDeque<u64>>>,
 }
 
 impl Child {
-    /// Sends calls, and takes what is answered.
+    /// Sends calls, and takes the responses.
     pub(super) fn call_all(&self, client: &Client, random: &mut Random) {
         let (mut number, mut next) = (0, Instant::now());
         let mut last = HashMap::new();
@@ -61,7 +61,7 @@ impl Child {
             }
             let mut request = vec![0; length(random)];
             fill(stamp(client.gid()), number + 1, &mut request);
-            // An answer may be here before `send_request` returns.
+            // A response may arrive before `send_request` returns.
             match client.send_request(&request) {
                 Ok(sent) => {
                     number += 1;
@@ -77,14 +77,14 @@ impl Child {
         }
     }
 
-    /// The calls that the slowest of these servers has not answered.
+    /// Returns the largest number of unanswered calls of any of these servers.
     fn unanswered(&self, servers: &[Gid]) -> usize {
         let due = self.calls.due.lock().expect("no panic");
         servers.iter().filter_map(|server| due.get(server)).map(VecDeque::len).max().unwrap_or(0)
     }
 
-    /// Waits until every server that is there has answered, and notes what those that are gone have not. The first
-    /// server that does not answer, if there is one.
+    /// Waits until every existing server has answered, and records the calls that servers which are gone did not
+    /// answer. Returns the first server that does not answer, if any.
     pub(super) fn finish_calls(&self, client: &Client) -> Option<Gid> {
         let silent = || {
             let servers = client.servers();
@@ -129,7 +129,7 @@ impl Child {
     }
 }
 
-/// Each power of two as often as the next.
+/// Returns a length; each power of two is equally likely.
 fn length(random: &mut Random) -> usize {
     let most = 1_u64 << random.below(LONGEST_POWER);
     usize::try_from(random.below(most + 1)).expect("at most some hundred thousand")

@@ -1,4 +1,4 @@
-//! One of the processes: publishes, takes, calls and answers until it is told to come to an end, or is killed.
+//! One of the processes: it publishes, takes, calls and answers until it is told to end, or is killed.
 
 mod calls;
 mod publishing;
@@ -22,23 +22,23 @@ use axon_transport::{
 use self::{calls::Calls, publishing::Stream};
 use crate::{pair_log::PairLog, sample::Random};
 
-/// The environment variable that makes a process one of them; its value is the seed.
+/// The environment variable that makes this program one of the processes. Its value is the seed.
 pub(crate) const ROLE: &str = "TORTURE_SEED";
-/// How much less of the processor these have than the conductor, which is to disturb them in time however busy the
-/// machine is.
+/// The niceness of the processes. The conductor has a higher priority, so that it disturbs them in time however busy
+/// the machine is.
 const NICER: i32 = 5;
-/// What it takes if it is not wedged.
+/// Time after which an operation counts as stuck.
 const PATIENCE: Duration = Duration::from_secs(120);
 
 struct Child {
     session: Session,
-    /// The GID of the subscription that must miss nothing.
+    /// The GID of the subscription that must not miss a sample.
     gapless: String,
-    /// KEEP_ALL and KEEP_LAST.
+    /// The KEEP_ALL and the KEEP_LAST publisher.
     streams: [Mutex<Stream>; 2],
     quiet: AtomicBool,
     over: AtomicBool,
-    /// The last sample of each publisher that was taken, of those of which none may be missed.
+    /// The last taken sample of each publisher of which no sample may be missed.
     last: Mutex<HashMap<Gid, u64>>,
     taken: AtomicU64,
     calls: Calls,
@@ -52,21 +52,21 @@ struct Miss {
     kind: Kind,
     partner: Gid,
     messages: u64,
-    /// When that was seen, in milliseconds since the epoch.
+    /// The time when that was seen, in milliseconds since the epoch.
     at: u128,
 }
 
-/// What did not come.
+/// The kind of the missing messages.
 #[derive(Clone, Copy)]
 enum Kind {
-    /// Samples for the KEEP_ALL subscription, though later ones did.
+    /// Samples for the KEEP_ALL subscription, although later ones arrived.
     Sample {
-        /// Whether the subscription says that they are lost.
+        /// True if the subscription counts them as lost.
         counted: bool,
     },
-    /// Requests for the server, though later ones did.
+    /// Requests for the server, although later ones arrived.
     Request,
-    /// Responses for the client, though later ones did.
+    /// Responses for the client, although later ones arrived.
     Response,
     /// Responses of a server that is gone.
     Unanswered,
@@ -89,7 +89,7 @@ fn spec(topic: &str, qos: Qos) -> EndpointSpec {
 }
 
 pub(crate) fn run(seed: u64) {
-    // The other threads would wait for one that fails, and the conductor for all of them.
+    // If one thread fails, the other threads would wait for it, and the conductor for all of them.
     let print = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |info| {
         print(info);
@@ -102,7 +102,7 @@ pub(crate) fn run(seed: u64) {
     let session = loop {
         match Session::open(&config, SessionOptions::new("torture")) {
             Ok(session) => break session,
-            // Daemons are killed while they start, too.
+            // Daemons are also killed while they start.
             Err(error) => assert!(start.elapsed() < PATIENCE, "{error}"),
         }
     };
@@ -144,7 +144,7 @@ pub(crate) fn run(seed: u64) {
 }
 
 impl Child {
-    /// Does what the conductor says, a line at a time, until that one closes the pipe or has this process end.
+    /// Follows the conductor's orders, one line at a time, until it closes the pipe or ends this process.
     fn obey(&self, client: &Client) {
         for line in io::stdin().lock().lines() {
             let line = line.expect("text");
@@ -163,7 +163,7 @@ impl Child {
                     });
                     say(&misses.collect::<Vec<_>>().join(" "));
                 }
-                // Of the pairs with this reader or writer, for people.
+                // Prints the log of the pairs with this reader or writer, for people.
                 Some("pair_log") => {
                     self.pair_log.print(words.next().expect("a GID"));
                     say("printed");
@@ -174,7 +174,7 @@ impl Child {
                     Some(server) => say(&format!("{} {}", hex(client.gid()), hex(server))),
                     None => say("answered"),
                 },
-                // After some milliseconds.
+                // Ends after the given number of milliseconds.
                 Some("end") => {
                     let after = words.next().and_then(|n| n.parse().ok()).expect("a time");
                     let process = words.next() == Some("process");
@@ -194,7 +194,7 @@ impl Child {
                     let unmet = || self.pair_log.unmet(&self.gapless, Some(&gid));
                     let done = || reached() || unmet().is_some();
                     let came = self.session.wait(done, Some(PATIENCE));
-                    // All that it left was lost to the subscription, or nothing.
+                    // The subscription lost all of its samples, or none.
                     if let Some(samples) = unmet() {
                         let taken = self.last.lock().expect("no panic");
                         let taken = taken.keys().any(|publisher| hex(*publisher) == gid);
@@ -218,7 +218,7 @@ impl Child {
         }
     }
 
-    /// Notes the messages missing before the one that came.
+    /// Records the messages that are missing before the one that arrived.
     fn missed(&self, kind: Kind, info: &MessageInfo, messages: u64) {
         self.note(kind, info.publisher, messages);
         self.pair_log.add(&format!(
@@ -236,7 +236,7 @@ impl Child {
     }
 }
 
-/// What the pattern knows of a publisher.
+/// Returns the part of a publisher's GID that the pattern contains.
 fn stamp(gid: Gid) -> u64 {
     let (low, high) = gid.0.split_at(8);
     let word = |half: &[u8]| u64::from_le_bytes(half.try_into().expect("eight bytes"));
@@ -247,7 +247,7 @@ fn hex(gid: Gid) -> String {
     gid.0.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// A line to the conductor.
+/// Sends a line to the conductor.
 fn say(text: &str) {
     let mut out = io::stdout().lock();
     writeln!(out, "{text}").and_then(|()| out.flush()).expect("somebody who listens");

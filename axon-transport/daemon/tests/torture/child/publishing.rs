@@ -12,7 +12,7 @@ use axon_transport::Publisher;
 use super::{Child, hex, say, spec, stamp};
 use crate::sample::{Random, fill};
 
-/// A publisher and how many samples it has published. Publishing and ending hold its lock.
+/// A publisher, and the number of samples that it has published. Publishing and ending hold its lock.
 pub(super) struct Stream {
     publisher: Publisher,
     published: u64,
@@ -46,7 +46,7 @@ impl Child {
         self.streams[which].lock().expect("no panic")
     }
 
-    /// Everybody in `readers` is matched, and then this publishes ten samples.
+    /// Waits until all `readers` are matched, and then publishes ten samples.
     pub(super) fn finish(&self, readers: &[&str], patience: Duration) {
         let start = std::time::Instant::now();
         let mut stream = self.stream(0);
@@ -62,15 +62,15 @@ impl Child {
         say(&format!("{} {}", hex(stream.publisher.gid()), stream.published));
     }
 
-    /// Ends the KEEP_ALL publisher after a last sample, and says its GID, the number of that sample, and the
-    /// readers that must come to have it. Another publisher takes its place unless the process is to end.
+    /// Ends the KEEP_ALL publisher after a last sample. Reports its GID, the number of that sample, and the readers
+    /// that must get it. Another publisher replaces it unless the process is about to end.
     pub(super) fn end_publisher(&self, process: bool) {
         let mut stream = self.stream(0);
         let readers: Vec<String> = stream.publisher.matched().into_iter().map(hex).collect();
         self.publish(&mut stream, 100);
         let (gid, last) = (hex(stream.publisher.gid()), stream.published);
         if process {
-            // The publisher ends with its session.
+            // The publisher ends together with its session.
             self.over.store(true, Ordering::Relaxed);
         } else {
             let spec = spec("/all", axon_transport::qos::Qos::keep_all());
@@ -83,10 +83,10 @@ impl Child {
         (0..2).map(|which| self.stream(which).published).sum()
     }
 
-    /// Takes a loan, publishes other samples, and publishes or drops the loan only then.
+    /// Takes a loan, publishes other samples, and only then publishes or drops the loan.
     fn publish_around_loan(&self, stream: &mut Stream, random: &mut Random) {
         let (length, others) = (random.length(), 1 + random.below(3));
-        // Samples through copies and loans of the publisher itself go out while this loan is held.
+        // The publisher publishes other samples, by copy and by loan, while this loan is held.
         let held = stream.publisher.loan(length).ok().map(|mut loan| {
             let mut published = stream.published;
             for _ in 0..others {
@@ -114,12 +114,12 @@ impl Child {
         }
     }
 
-    /// Publishes a sample, whatever it takes, unless all is over.
+    /// Publishes a sample. Retries as long as necessary, unless the test is over.
     fn publish(&self, stream: &mut Stream, length: usize) {
         stream.published = self.publish_next(&stream.publisher, stream.published, length);
     }
 
-    /// The same; how many are published then.
+    /// Like [`publish`](Self::publish); returns the number of published samples.
     fn publish_next(&self, publisher: &Publisher, published: u64, length: usize) -> u64 {
         let next = published + 1;
         let mut payload = vec![0; length];
@@ -146,7 +146,7 @@ impl Child {
     }
 }
 
-/// Whether a peer is stopped, or slow, or keeps too much: it may work the next time.
+/// Returns whether the error is temporary: a peer is stopped, slow or keeps too much.
 pub(super) fn is_for_now(error: &PublishError) -> bool {
     matches!(
         error,

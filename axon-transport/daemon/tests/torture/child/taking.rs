@@ -12,9 +12,9 @@ use axon_transport::{MessageInfo, Subscription};
 use super::{Child, Kind, stamp};
 use crate::sample::{Random, is_whole};
 
-/// Samples that a subscription holds at most.
+/// Maximum number of samples that a subscription holds.
 const HELD: usize = 4;
-/// For how long it holds one at most, in milliseconds.
+/// Maximum time for which it holds one, in milliseconds.
 const HOLD_MS: u64 = 2000;
 
 impl Child {
@@ -26,7 +26,7 @@ impl Child {
         while !self.over.load(Ordering::Relaxed) {
             let ready = || subscription.has_data() || self.over.load(Ordering::Relaxed);
             self.session.wait(ready, Some(Duration::from_millis(50)));
-            // What was held is still what it was when the publisher has gone far beyond it.
+            // A held sample must be unchanged when the publisher is far ahead of it.
             let now = Instant::now();
             while held.len() > HELD || held.front().is_some_and(|(until, ..)| *until <= now) {
                 let (_, info, sample) = held.pop_front().expect("just looked");
@@ -50,11 +50,11 @@ impl Child {
                 let missed = info.sequence - before - 1;
                 if gapless && missed > 0 {
                     all_missed += missed;
-                    // What was lost with publishers that were unmet left no gap.
+                    // Losses of publishers that were never met left no gap.
                     let unmet = self.pair_log.unmet(&self.gapless, None).unwrap_or(0);
                     let lost = subscription.lost().saturating_sub(unmet);
                     let counted = all_missed <= lost;
-                    // Each miss that is not counted is told of once.
+                    // Each miss that is not counted is reported once.
                     all_missed = all_missed.min(lost);
                     // A publisher does not wait for subscriptions of its own session.
                     if !info.publisher.is_of(&self.session.id()) {
@@ -65,7 +65,7 @@ impl Child {
             self.taken.fetch_add(1, Ordering::Relaxed);
             if gapless {
                 self.last.lock().expect("no panic").insert(info.publisher, info.sequence);
-                // The thread that waits for the last of all looks again.
+                // Wakes the thread that waits for the last sample of all publishers.
                 self.session.segment().notify();
             }
         }

@@ -20,18 +20,18 @@ use crate::{
     sample::{LONGEST, Random},
 };
 
-/// Of so many processes one is in a PID namespace of its own.
+/// One of this many processes is in its own PID namespace.
 const NAMESPACED: u64 = 3;
 
-/// What starts a process in a PID namespace of its own.
+/// The ways to start a process in its own PID namespace.
 #[derive(Debug, Default)]
 pub(crate) struct Namespaces {
-    /// Arguments of `unshare`: with the `/proc` of the outer namespace, and with a new one.
+    /// The arguments of `unshare`: with the `/proc` of the outer namespace, and with a new one.
     ways: Vec<Vec<&'static str>>,
 }
 
 impl Namespaces {
-    /// Tries what this machine allows.
+    /// Finds out what this machine permits.
     pub(crate) fn find() -> Self {
         let pid = ["--pid", "--fork", "--kill-child"];
         let user = ["--user", "--map-current-user"];
@@ -51,7 +51,7 @@ impl Namespaces {
         !self.ways.is_empty()
     }
 
-    /// The command that a process is started by, and whether it starts the process as a child of its own.
+    /// Returns the command that starts a process, and whether the process is a child of the started one.
     fn command(&self, random: &mut Random) -> (Command, bool) {
         let program = env::current_exe().expect("its own path");
         if self.ways.is_empty() || random.below(NAMESPACED) > 0 {
@@ -69,7 +69,7 @@ pub(super) struct Host<'a> {
     namespaces: &'a Namespaces,
 }
 
-/// When a player's publisher ends, and what ends with it.
+/// The part of a player that ends.
 #[derive(Clone, Copy, PartialEq)]
 pub(super) enum Ending {
     Publisher,
@@ -79,18 +79,18 @@ pub(super) enum Ending {
 /// One of the processes.
 pub(super) struct Player {
     process: Child,
-    /// Whether `process` is the parent of the process that is meant.
+    /// True if `process` is the parent of the playing process.
     namespaced: bool,
-    /// That process.
+    /// The playing process in that case.
     inner: Option<u32>,
-    /// Until it is to end.
+    /// `None` once it has been told to end.
     orders: Option<ChildStdin>,
     answers: Receiver<String>,
-    /// Its KEEP_ALL subscription, once it has said so.
+    /// The GID of its KEEP_ALL subscription, once it has reported it.
     reader: Option<String>,
-    /// Until when it is stopped.
+    /// The time until which it is stopped.
     pub(super) stopped: Option<Instant>,
-    /// It was told so, and has not said yet that it has.
+    /// Set if it was told to end this, and has not reported yet that it has.
     pub(super) ending: Option<Ending>,
 }
 
@@ -109,7 +109,7 @@ impl<'a> Host<'a> {
             .env(ROLE, seed.to_string())
             .env("AXON_RUNTIME_DIR", self.dir.path().join("run"))
             .env("AXON_DAEMON_PATH", env!("CARGO_BIN_EXE_axon_daemon"))
-            // A daemon in a PID namespace sees no process outside it, and would relay all of them.
+            // A daemon in a PID namespace sees no process outside, and would relay all of them.
             .env("AXON_DAEMON", if namespaced { "require" } else { "spawn" })
             .env("AXON_BIND_ADDRS", "127.0.0.1")
             .env("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
@@ -135,7 +135,7 @@ impl<'a> Host<'a> {
         }
     }
 
-    /// The daemon's process, if there is one.
+    /// Returns the daemon's process, if there is one.
     pub(super) fn daemon(&self) -> Option<Pid> {
         let run = self.dir.path().join("run");
         let of_this_host = |pid: &u32| {
@@ -169,7 +169,7 @@ fn pid(process: u32) -> Option<Pid> {
 }
 
 impl Player {
-    /// The process that plays, once it is there.
+    /// Returns the playing process, once it exists.
     pub(super) fn id(&mut self) -> Option<u32> {
         let outer = self.process.id();
         if !self.namespaced {
@@ -182,15 +182,15 @@ impl Player {
         self.inner
     }
 
-    /// Whether it is in a PID namespace of its own.
+    /// Returns whether it is in its own PID namespace.
     pub(super) fn is_namespaced(&self) -> bool {
         self.namespaced
     }
 
-    /// Stops it for `pause`, if it is there.
+    /// Stops it for `pause`, if it exists. Returns whether it does.
     pub(super) fn stop(&mut self, pause: Duration) -> bool {
         let Some(process) = self.id().and_then(pid) else { return false };
-        // One that is to end may have ended.
+        // A process that was told to end may have ended.
         let is_there = kill_process(process, Signal::STOP).is_ok();
         self.stopped = is_there.then(|| Instant::now() + pause);
         is_there
@@ -217,7 +217,7 @@ impl Player {
         self.line()
     }
 
-    /// What it says next, if it has said something.
+    /// Returns its next line, if there is one.
     pub(super) fn heard(&mut self) -> Option<String> {
         self.known()?;
         match self.answers.try_recv() {
@@ -229,7 +229,7 @@ impl Player {
         }
     }
 
-    /// Its KEEP_ALL subscription.
+    /// Returns the GID of its KEEP_ALL subscription.
     pub(super) fn reader(&mut self) -> String {
         if self.reader.is_none() {
             self.reader = Some(self.line());
@@ -237,7 +237,7 @@ impl Player {
         self.reader.clone().expect("just said")
     }
 
-    /// The same, if it has said so.
+    /// Returns the GID of its KEEP_ALL subscription, if it has reported it.
     pub(super) fn known(&mut self) -> Option<&str> {
         if self.reader.is_none() {
             self.reader = self.answers.try_recv().ok();
@@ -271,13 +271,13 @@ impl Player {
         }
     }
 
-    /// Whether it has ended as it was told to; panics if otherwise.
+    /// Returns whether it has ended as it was told to. Panics if it failed.
     pub(super) fn has_ended(&mut self) -> bool {
         let status = self.process.try_wait().expect("a child");
         status.inspect(|status| assert!(status.success(), "a process failed: {status}")).is_some()
     }
 
-    /// Has it end, and waits for that.
+    /// Ends it, and waits for that.
     pub(super) fn end(mut self) {
         self.orders = None;
         assert!(self.process.wait().expect("a child").success());
@@ -297,7 +297,7 @@ impl Drop for Player {
     }
 }
 
-/// What each thread of a process waits for, as far as the system tells.
+/// Returns what each thread of a process waits for, if the system tells.
 fn threads(process: u32) -> String {
     let tasks = fs::read_dir(format!("/proc/{process}/task")).into_iter().flatten().flatten();
     let describe = |task: fs::DirEntry| {
@@ -308,7 +308,7 @@ fn threads(process: u32) -> String {
     tasks.map(describe).collect()
 }
 
-/// Bytes of shared memory that processes hold descriptors of, each counted once.
+/// Returns the bytes of shared memory to which processes hold descriptors, each segment counted once.
 pub(super) fn held(pids: impl Iterator<Item = u32>) -> u64 {
     let mut blocks = HashMap::new();
     for pid in pids {

@@ -1,4 +1,4 @@
-//! Asks the processes in the end whether all is well.
+//! Asks the processes at the end whether all is well.
 
 use std::collections::{HashMap, HashSet};
 
@@ -7,46 +7,48 @@ use super::{
     round::Gone,
 };
 
-/// How long before a reader gives up what it waits for a daemon may have been killed that could have handed it over, in
-/// milliseconds: it waits for ten seconds, and may be stopped for four.
+/// A reader may give up memory that a killed daemon could have passed on, if the daemon was killed at most this many
+/// milliseconds before: the reader waits ten seconds, and may be stopped for four.
 const DAEMON: u128 = 15_000;
 
-/// How long after one gap a reader may give up the next one of the same dead process, in milliseconds: it waits for a
+/// Milliseconds after one gap within which a reader may give up the next one of the same dead process: it waits one
 /// second more, may be stopped for four, and the machine is busy.
 const NEXT_GAP: u128 = 6_000;
 
-/// How long before its end a process may have had no daemon to tell what its readers lost: it waits for two seconds, and
-/// says that it ends some time before it does. And how long after it the daemon may have been killed that it told, before
-/// the readers were: they may be stopped for four seconds, and then have to come to that daemon.
+/// The first number is how many milliseconds before its end a process may have had no daemon to report its readers'
+/// losses to: it waits two seconds, and announces its end some time before. The second is how many milliseconds after
+/// the end the daemon that got the report may have been killed before it told the readers: they may be stopped for four
+/// seconds, and then have to connect to that daemon.
 const UNTOLD: [u128; 2] = [5_000, 15_000];
 
-/// What happened to endpoints that are gone.
+/// The history of endpoints that are gone.
 #[derive(Default)]
 pub(super) struct Past {
-    /// When the process of each KEEP_ALL reader was killed, in milliseconds since the epoch.
+    /// The time at which the process of each KEEP_ALL reader was killed, in milliseconds since the epoch.
     pub(super) deaths: HashMap<String, u128>,
-    /// Publishers that ended.
+    /// The publishers that ended.
     pub(super) ended: Vec<Ended>,
-    /// When processes ended, by their session, in milliseconds since the epoch.
+    /// The time at which processes ended, by session, in milliseconds since the epoch.
     pub(super) ends: HashMap<String, u128>,
-    /// When daemons were killed, in milliseconds since the epoch.
+    /// The times at which daemons were killed, in milliseconds since the epoch.
     pub(super) daemons: Vec<u128>,
 }
 
 impl Past {
-    /// Whether a daemon was killed shortly before a reader gave something up.
+    /// Returns whether a daemon was killed shortly before a reader gave something up.
     fn lost_daemon(&self, given_up: u128) -> bool {
         let shortly = given_up.saturating_sub(DAEMON)..=given_up;
         self.daemons.iter().any(|killed| shortly.contains(killed))
     }
 
-    /// A process ends now.
+    /// Records that a process ends now.
     pub(super) fn process_ends(&mut self, gid: &str, now: u128) {
         self.ends.insert(session(gid).to_owned(), now);
     }
 
-    /// Whether nobody was left to tell a reader what it lost of a publisher: its process has ended, and so has the one
-    /// daemon that it told, or there was none that it could tell. As long as the process lives it tells every daemon.
+    /// Returns whether no process was left to tell a reader what it lost of a publisher. The publisher's process has
+    /// ended, and either the one daemon that it told has, too, or there was no daemon to tell. A living process tells
+    /// every daemon.
     fn left_nobody(&self, publisher: &str) -> bool {
         let Some(end) = self.ends.get(session(publisher)) else { return false };
         let around = end.saturating_sub(UNTOLD[0])..=end + UNTOLD[1];
@@ -58,7 +60,7 @@ impl Past {
 pub(super) struct Ended {
     gid: String,
     last: String,
-    /// Those that were matched before it published its last sample.
+    /// The readers that were matched before it published its last sample.
     readers: HashSet<String>,
 }
 
@@ -67,7 +69,7 @@ impl Ended {
         &self.gid
     }
 
-    /// What a process says of it.
+    /// Parses the report of a process about it.
     pub(super) fn parse(line: &str) -> Self {
         let mut words = line.split_ascii_whitespace().map(str::to_owned);
         let mut word = || words.next().expect("a GID and a number");
@@ -75,17 +77,18 @@ impl Ended {
     }
 }
 
-/// The session of an endpoint: a GID begins with that of its session.
+/// Returns the session of an endpoint: a GID begins with the id of its session.
 fn session(gid: &str) -> &str {
     &gid[..24]
 }
 
-/// Every process must come to have the last samples of every other, and of those that ended. Every call must be
-/// answered.
+/// Checks that every process gets the last samples of every other, and of the publishers that ended, and that every
+/// call is answered.
 ///
-/// Returns how many pairs of a reader and a publisher that ended never came about, though the publisher counted the
-/// reader: the daemon between them was killed before the reader was told, and the publisher ended before the next one
-/// matched them. Of the first the reader counts the samples as lost. Of the others nobody could tell it.
+/// Returns how many pairs of a reader and an ended publisher never came about, although the publisher counted the
+/// reader. In such a pair, the daemon was killed before it told the reader, and the publisher ended before the next
+/// daemon matched them. The first number counts pairs whose reader counts the samples as lost. The second counts pairs
+/// whose reader no process could tell.
 pub(super) fn come_to_rest(players: &mut [Player], past: &mut Past) -> [u64; 2] {
     for player in players.iter_mut() {
         player.resume();
@@ -113,7 +116,7 @@ pub(super) fn come_to_rest(players: &mut [Player], past: &mut Past) -> [u64; 2] 
     for (index, player) in players.iter_mut().enumerate() {
         lasts.push((index, player.ask(&format!("final{subscriptions}"))));
     }
-    // What a process left is gone with it if it was killed later.
+    // The samples that a process left are lost with it if it was killed later.
     let killed: HashSet<&str> = past.deaths.keys().map(|reader| session(reader)).collect();
     past.ended.retain(|ended| !killed.contains(session(&ended.gid)));
     let (mut unmet, mut wrong) = ([0; 2], Vec::new());
@@ -151,9 +154,10 @@ pub(super) fn come_to_rest(players: &mut [Player], past: &mut Past) -> [u64; 2] 
     unmet
 }
 
-/// What did not come. KEEP_ALL subscriptions must not miss a sample of a publisher that lived, and must count those
-/// that they missed of one that was dead by then. Servers and clients must not miss a message of one that lived. What a
-/// process left that ended by itself must come, too, unless a daemon was killed: it may have held the memory.
+/// Collects the missing messages. A KEEP_ALL subscription must not miss a sample of a living publisher, and must count
+/// the samples that it misses of a dead one. Servers and clients must not miss a message of a living peer. The messages
+/// of a process that ended by itself must arrive, too, unless a daemon was killed: that daemon may have held the
+/// memory.
 pub(super) fn missed(players: &mut [Player], past: &Past) -> Gone {
     let deaths: HashMap<&str, u128> =
         past.deaths.iter().map(|(reader, at)| (session(reader), *at)).collect();
@@ -165,7 +169,7 @@ pub(super) fn missed(players: &mut [Player], past: &Past) -> Gone {
     for (index, player) in players.iter_mut().enumerate() {
         let answer = player.ask("missed");
         let words: Vec<&str> = answer.split_ascii_whitespace().collect();
-        // When this reader last gave up a gap in memory that a killed daemon may have held, by publisher.
+        // The time at which this reader last gave up a gap in memory that a killed daemon may have held, by publisher.
         let mut gaps: HashMap<&str, u128> = HashMap::new();
         for [partner, messages, at, what] in words.as_chunks::<4>().0 {
             let at: u128 = at.parse().expect("a time");
@@ -205,8 +209,8 @@ pub(super) fn missed(players: &mut [Player], past: &Past) -> Gone {
     gone
 }
 
-/// Has the process at `index` print what it knows of `other`, and the process of that one what it knows of `own`.
-/// Whether there is such a process.
+/// Makes the process at `index` print its log of `other`, and the process of `other` its log of `own`. Returns whether
+/// the latter process exists.
 fn print_pair(players: &mut [Player], index: usize, own: &str, other: &str) -> bool {
     players[index].ask(&format!("pair_log {other}"));
     let mut lives = false;

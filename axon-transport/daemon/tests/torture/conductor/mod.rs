@@ -1,4 +1,4 @@
-//! Starts the processes, disturbs them, and asks in the end whether all is well.
+//! Starts the processes, disturbs them, and asks them at the end whether all is well.
 
 mod host;
 mod judge;
@@ -19,14 +19,15 @@ use self::{
 };
 use crate::sample::{LONGEST, Random};
 
-/// How the processes are disturbed.
+/// The way in which the processes are disturbed.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Plan {
-    /// Eight of them are stopped for some tenths of a second at most, often.
+    /// Eight processes are often stopped for at most some tenths of a second.
     Brief,
-    /// Twelve are stopped for some seconds, and the daemon is killed meanwhile.
+    /// Twelve processes are stopped for some seconds, and the daemon is killed meanwhile.
     Stops,
-    /// The same, and the daemon lives: what a publisher leaves that ends must come to every reader.
+    /// Like `Stops`, but the daemon lives: the samples of a publisher that ended must reach every
+    /// reader.
     Ends,
 }
 
@@ -38,7 +39,7 @@ impl Plan {
         }
     }
 
-    /// What happens next, mostly nothing.
+    /// Returns the next disturbance, which mostly is none.
     fn next(self, random: &mut Random) -> Disturbance {
         match (self, random.below(1000)) {
             (Self::Brief, 0..120) => Disturbance::Kill,
@@ -60,45 +61,47 @@ impl Plan {
     }
 }
 
-/// What happens to one process or to the daemon.
+/// A disturbance of one process or of the daemon.
 enum Disturbance {
     None,
     Kill,
     Stop(Duration),
-    /// The daemon is killed while it is stopped, and some that come back to the next one.
+    /// A process is stopped. The daemon is killed meanwhile, and so are some processes that connect
+    /// to the next one.
     StopAround(Duration),
     Daemon,
 }
 
-/// One that is asked and says nothing for so long stands still.
+/// A process that does not answer for this long is stuck.
 const PATIENCE: Duration = Duration::from_secs(180);
-/// `AXON_RING_BUFFER_SIZE_MB` of each.
+/// The `AXON_RING_BUFFER_SIZE_MB` of each process.
 const BUDGET_MB: u64 = 16;
-/// What a process may hold: of each of its two publishers the budget, and what samples that are
-/// pinned, lent or being replaced may take beside it; and its session, with its calls.
+/// Memory that a process may hold: for each of its two publishers the budget, and the samples that
+/// are pinned, lent or being replaced; and its session with its calls.
 const CEILING_MB: u64 = 2 * (2 * BUDGET_MB + 8 * (LONGEST as u64 >> 20)) + 4;
 
-/// For how long after the daemon's death those that come back to the next one are killed often.
+/// Time after the daemon's death during which processes that connect to the next one are often
+/// killed.
 const COMING_BACK: Duration = Duration::from_millis(800);
-/// How often the memory that they hold is added up, which takes a while.
+/// Interval of adding up the memory that they hold, which takes a while.
 const LOOK: Duration = Duration::from_millis(200);
 
-/// The processes of a round, and what was done to them.
+/// The processes of a round, and the disturbances so far.
 struct Game<'a> {
     plan: Plan,
     host: Host<'a>,
     random: Random,
     players: Vec<Player>,
-    /// Those that have ended their publisher and are to end.
+    /// The processes that have ended their publisher and are about to end.
     leaving: Vec<(Player, Instant)>,
     done: Done,
     past: Past,
     kill_daemon_at: Option<Instant>,
-    /// Until when processes are killed often.
+    /// The time until which processes are often killed.
     rough_until: Instant,
 }
 
-/// Disturbs them for `time`, and then has them come to rest.
+/// Disturbs the processes for `time`, and then lets them come to rest.
 pub(crate) fn run(plan: Plan, time: Duration, seed: u64, namespaces: &Namespaces) -> Round {
     let start = Instant::now();
     let mut game = Game {
@@ -198,7 +201,7 @@ impl Game<'_> {
         }
     }
 
-    /// Continues those whose time has come. Then a publisher ends, 0.3 to 1 s later.
+    /// Continues the processes whose time has come. A publisher then ends, 0.3 to 1 s later.
     fn resume(&mut self) {
         for index in 0..self.players.len() {
             self.players[index].must_live();
@@ -219,7 +222,7 @@ impl Game<'_> {
         }
     }
 
-    /// Another process takes the place of one that ends.
+    /// Replaces each process that ends by another one.
     fn hear_of_ends(&mut self) {
         for index in 0..self.players.len() {
             let player = &mut self.players[index];
@@ -245,7 +248,7 @@ impl Game<'_> {
         });
     }
 
-    /// The same, once all that were told to end have.
+    /// Waits until all processes that were told to end have.
     fn without_leaving(mut self) -> Self {
         let ends = |player: &Player| player.ending == Some(Ending::Process);
         while !self.leaving.is_empty() || self.players.iter().any(ends) {
@@ -256,7 +259,7 @@ impl Game<'_> {
         self
     }
 
-    /// The bytes of shared memory that all hold.
+    /// Returns the bytes of shared memory that all processes hold.
     fn held(&mut self) -> u64 {
         let daemon = self.host.daemon().map(|pid| pid.as_raw_nonzero().get().unsigned_abs());
         let leaving = self.leaving.iter_mut().map(|(player, _)| player);
@@ -269,7 +272,7 @@ impl Game<'_> {
     }
 }
 
-/// Milliseconds since the epoch.
+/// Returns the milliseconds since the epoch.
 fn epoch() -> u128 {
     let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
     now.expect("after the epoch").as_millis()

@@ -4,7 +4,7 @@ use std::{fmt, time::Duration};
 
 use super::{CEILING_MB, Plan};
 
-/// What was done to the processes, and what those that lived to the end did meanwhile.
+/// The disturbances of a round, and the work of the processes that lived to its end.
 pub(crate) struct Round {
     pub(super) plan: Plan,
     pub(super) seed: u64,
@@ -12,35 +12,36 @@ pub(crate) struct Round {
     pub(super) done: Done,
     pub(super) published: u64,
     pub(super) taken: u64,
-    /// Responses taken.
+    /// Number of responses taken.
     pub(super) answers: u64,
     pub(super) gone: Gone,
-    /// The most shared memory at a time, in bytes.
+    /// The largest amount of shared memory at a time, in bytes.
     pub(super) most: u64,
 }
 
-/// What was done to the processes and the daemon.
+/// The disturbances of the processes and the daemon.
 #[derive(Default)]
 pub(super) struct Done {
-    /// Processes that were started in a PID namespace of their own.
+    /// Number of processes that were started in their own PID namespace.
     pub(super) namespaced: u32,
     pub(super) kills: u32,
     pub(super) stops: u32,
     pub(super) daemons: u32,
-    /// Publishers that ended, and processes that did.
+    /// Number of publishers and processes that ended.
     pub(super) ends: u32,
 }
 
-/// What did not come, and did not have to.
+/// Messages that did not arrive, and did not have to.
 #[derive(Default)]
 pub(super) struct Gone {
-    /// Samples of publishers that were killed, in memory that had not reached their subscribers.
+    /// Number of samples of killed publishers, in memory that had not reached their subscribers.
     pub(super) samples: u64,
-    /// Calls of or to processes that were killed, or ended.
+    /// Number of calls of or to processes that were killed or ended.
     pub(super) calls: u64,
-    /// Pairs with a publisher that ended that never came about: the reader counts what it lost.
+    /// Number of pairs with an ended publisher that never came about, and whose reader counts its
+    /// losses.
     pub(super) unmet: u64,
-    /// The same of which nobody was left to tell the reader.
+    /// Number of such pairs whose reader no process was left to tell.
     pub(super) untold: u64,
 }
 
