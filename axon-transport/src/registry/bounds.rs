@@ -1,4 +1,4 @@
-//! Tests the limits on the requests of one session to the daemon, however often it asks.
+//! Tests the limits on the requests of one session to the daemon, however often the session asks.
 
 use axon_shm::internal::Location;
 
@@ -83,7 +83,7 @@ fn the_pairs_that_a_session_makes_are_bounded_and_others_make_theirs() {
     let shown = registry.take_refused();
     assert!(matches!(&shown[..], [(of, why)] if *of == id(1) && why.contains("pairs")), "once");
 
-    // Both are shown where they would be, until they end or are taken.
+    // The status shows both where they were announced, until they end or are accepted.
     let refused = |registry: &Registry<Label>| -> Vec<(Gid, String)> {
         let all = registry.session(&id(1)).unwrap().refused_endpoints();
         all.map(|(endpoint, why)| (endpoint.gid, why.to_owned())).collect()
@@ -124,7 +124,7 @@ fn the_gateway_brings_the_publishers_of_other_hosts_to_every_reader() {
     assert_eq!(registry.pairs.len(), (readers * remote) as usize);
     assert!(registry.pairs.len() > MAX_PAIRS && registry.take_refused().is_empty());
 
-    // What all of them may make is bounded, and the gateway is told and stays.
+    // The pairs of all sessions together are bounded. The gateway gets a refusal and stays.
     for number in remote..=u32::try_from(MAX_ALL_PAIRS).unwrap() / readers {
         let endpoint = Endpoint::example(stand_in(number), EndpointKind::Publisher);
         announce_as(&mut registry, 1, endpoint, EndpointRole::StandIn);
@@ -176,7 +176,7 @@ fn sessions_that_are_told_everything_share_its_packets() {
         registry.poll_output(&id(number)).unwrap().packet
     });
     assert!(Arc::ptr_eq(&first[0], &first[1]));
-    // Of another version are others.
+    // Packets of another version are not shared.
     announce(&mut registry, 1, 1, EndpointKind::Subscription);
     registry.handle_message(&id(2), SessionMessage::Resync, vec![]).unwrap();
     while registry.session(&id(2)).is_some_and(|s| s.queued() > 0) {
@@ -210,7 +210,7 @@ fn a_sessions_queue_is_bounded_in_bytes() {
     assert_eq!(registry.session(&id(1)).unwrap().outbox.check(), 0);
 }
 
-/// What a session puts together of the parts that it is sent.
+/// Joins the parts of a status that a session is sent.
 fn put_together(messages: &[SessionMessage]) -> Vec<u8> {
     let mut text = Vec::new();
     for (number, message) in (0..).zip(messages) {
@@ -226,13 +226,13 @@ fn put_together(messages: &[SessionMessage]) -> Vec<u8> {
 fn a_status_larger_than_the_queue_is_told_whole() {
     for role in [SessionRole::Tool, SessionRole::Application] {
         let mut registry = registry(&[role]);
-        // As 40,000 pairs make.
+        // As large as the status of 40,000 pairs.
         let status: Vec<u8> = (0..6_000_000u32).map(|n| (n % 251) as u8).collect();
         assert!(status.len() > MAX_QUEUE_BYTES);
         registry.tell_status(&id(1), status.clone().into());
         assert_eq!(registry.take_ready(), [id(1)].into());
         assert_eq!(registry.session(&id(1)).unwrap().queued(), 0, "it waits in no queue");
-        // A socket that has no room for one of the parts, and for the last.
+        // A socket that has no room for one of the parts, and then for the last.
         let first = registry.poll_output(&id(1)).unwrap();
         registry.return_output(&id(1), first);
         let mut all = Vec::new();
@@ -273,7 +273,7 @@ fn a_pair_that_cannot_share_memory_is_shown_with_the_reason() {
     };
     assert_eq!(fail(&mut registry, 3), Err(Violation::NotItsOwn(reader)));
     assert!(registry.take_refused().is_empty());
-    // The publisher's side says so; its reader may ask again.
+    // The publisher's side reports the failure. The pair stays, because the reader may ask again.
     fail(&mut registry, 1).unwrap();
     assert_eq!(registry.pairs.len(), 1);
     let shown = registry.take_refused();
@@ -283,7 +283,7 @@ fn a_pair_that_cannot_share_memory_is_shown_with_the_reason() {
         text.contains("\"/t\"") && text.contains("AXON_SHM") && text.contains("not  [1mmapped")
     );
     assert!(text.len() < 600 && !text.contains('\u{1b}'), "{text}");
-    // The reader's side ends it.
+    // A failure that the reader's side reports ends the pair.
     drain(&mut registry, 1);
     fail(&mut registry, 2).unwrap();
     assert!((registry.pairs.len() == 0));
@@ -292,12 +292,12 @@ fn a_pair_that_cannot_share_memory_is_shown_with_the_reason() {
     assert!(
         over.iter().any(|m| matches!(m, SessionMessage::Detach(pair) if pair.reader == reader))
     );
-    // And says nothing of what is no pair.
+    // A failure of a pair that no longer exists is not reported.
     fail(&mut registry, 2).unwrap();
     assert!(registry.take_refused().is_empty());
 }
 
-/// Session 2 reads from this publisher of session 1.
+/// Attaches a reader of session 2 to a publisher of session 1, and returns the publisher.
 fn attached(registry: &mut Registry<Label>) -> Gid {
     announce(registry, 1, 1, EndpointKind::Publisher);
     announce(registry, 2, 1, EndpointKind::Subscription);
@@ -335,7 +335,7 @@ fn segments_given_up_are_not_queued_for_a_stopped_session() {
         let segment = Segment { number, publisher };
         let opened = SessionMessage::Segment(SegmentOpened { session, segment });
         registry.handle_message(&session, opened, vec!["map"]).unwrap();
-        // The first is taken before it is given up.
+        // The first segment is taken before it is given up.
         let taken = (number == 1).then(|| drain(&mut registry, 2).len());
         let gone = SessionMessage::SegmentGone(SegmentName { session, number });
         registry.handle_message(&session, gone, vec![]).unwrap();
@@ -360,7 +360,7 @@ fn a_session_that_asked_again_for_memory_hears_that_it_is_given_up() {
     let opened = SessionMessage::Segment(SegmentOpened { session, segment });
     registry.handle_message(&session, opened, vec!["map"]).unwrap();
     assert_eq!(drain(&mut registry, 2).len(), 1);
-    // It has it, and it is on its way once more.
+    // The session asks for it although it has it, and the segment is in flight once more.
     let name = SegmentName { session, number };
     registry.handle_message(&id(2), SessionMessage::Need(name), vec![]).unwrap();
     registry.handle_message(&session, SessionMessage::SegmentGone(name), vec![]).unwrap();
@@ -445,7 +445,8 @@ fn a_leaving_writer_is_hidden_and_read_to_its_end() {
     assert!(told.iter().any(removed) && drain(&mut registry, 3).iter().any(removed));
     assert_ne!(registry.digest(), before);
 
-    // Nobody new gets it, and who is told everything anew hears so again, after the grant.
+    // No new reader gets it. A session that is sent the complete state is told again that the
+    // endpoint leaves, after the grant.
     announce(&mut registry, 3, 1, EndpointKind::Subscription);
     assert!(!drain(&mut registry, 3).iter().any(|m| matches!(m, SessionMessage::Match(_))));
     drain(&mut registry, 2);
@@ -456,7 +457,7 @@ fn a_leaving_writer_is_hidden_and_read_to_its_end() {
     let shows = |m: &SessionMessage| matches!(m, SessionMessage::Graph(graph) if graph.added.iter().any(|i| i.endpoint.gid == writer));
     assert!(!told.iter().any(shows));
 
-    // It has come back.
+    // The session has come back.
     leave(&mut registry, 1, false).unwrap();
     registry.flush();
     let told = drain(&mut registry, 3);

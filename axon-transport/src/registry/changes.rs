@@ -1,4 +1,4 @@
-//! The changes of the graph that sessions have not been told yet, and the packets that tell them.
+//! The changes of the graph that sessions have not been sent yet, and the packets that contain them.
 
 use std::{
     collections::{BTreeMap, BTreeSet, VecDeque},
@@ -12,21 +12,21 @@ use crate::{
     wire::session::{GraphItem, SessionGraph, SessionMessage},
 };
 
-/// Bytes of endpoints in one packet; leaves room for the rest of the message and one endpoint more.
+/// Bytes of endpoints in one packet. This leaves room for the rest of the message and one more endpoint.
 const PART: usize = 24 * 1024;
 
-/// An endpoint that is new in the graph, and its daemon where that is another host's.
+/// A new endpoint in the graph, and its daemon if it is on another host.
 pub(super) type NewEndpoint = (Arc<Endpoint>, Option<DaemonId>);
 
-/// What changed in the graph since sessions were told last, and its version.
+/// The changes of the graph since the last flush, and the graph's version.
 ///
-/// A GID that was removed and is back is in both lists: sessions hear of the removal first.
+/// A GID that was removed and is back is in both lists. A session is told of the removal first.
 #[derive(Debug, Default)]
 pub(super) struct GraphChanges {
     version: u64,
     pending: GraphChange,
-    /// GIDs of endpoints that ended while there was no daemon to tell, or while this daemon was new. A session that is
-    /// told everything hears of them.
+    /// GIDs of endpoints that ended while there was no daemon to tell, or while this daemon was new. They are part of
+    /// the complete state that a session is sent.
     tombstones: VecDeque<Gid>,
 }
 
@@ -34,21 +34,21 @@ pub(super) struct GraphChanges {
 #[derive(Debug, Default)]
 pub(super) struct GraphChange {
     pub(super) added: BTreeMap<Gid, NewEndpoint>,
-    /// Whether each was this host's own.
+    /// The removed GIDs; true for endpoints of this host.
     removed: BTreeMap<Gid, bool>,
     /// Endpoints of this host that ended. Sessions detach from them.
     pub(super) ended: BTreeSet<Gid>,
-    /// Endpoints of this host whose session lists other peers than the gateway was told.
+    /// Endpoints of this host whose session lists other peers than the gateway knows.
     pub(super) regraded: BTreeSet<Gid>,
 }
 
 impl GraphChange {
-    /// The GIDs that were removed, those of other hosts included.
+    /// Returns the GIDs that were removed, including those of other hosts.
     pub(super) fn removed(&self) -> Vec<Gid> {
         self.removed.keys().copied().collect()
     }
 
-    /// The GIDs of this host that were removed.
+    /// Returns the GIDs of this host that were removed.
     pub(super) fn own_removed(&self) -> Vec<Gid> {
         self.removed.iter().filter(|(_, own)| **own).map(|(gid, _)| *gid).collect()
     }
@@ -63,27 +63,27 @@ impl GraphChanges {
         self.version
     }
 
-    /// An endpoint came.
+    /// Adds an endpoint.
     pub(super) fn add(&mut self, endpoint: Arc<Endpoint>, daemon: Option<DaemonId>) {
-        // One that is back is attached to anew. That it had ended its partners have been told.
+        // The session of an endpoint that is back attaches its partners anew. They have been told that it had ended.
         self.pending.ended.remove(&endpoint.gid);
         self.pending.added.insert(endpoint.gid, (endpoint, daemon));
     }
 
-    /// An endpoint is gone, of this host if it is its `own`.
+    /// Removes an endpoint. `own` is true if it is of this host.
     pub(super) fn remove(&mut self, gid: Gid, own: bool) {
         self.pending.added.remove(&gid);
         *self.pending.removed.entry(gid).or_default() |= own;
     }
 
-    /// An endpoint of this host ended.
+    /// Removes an endpoint of this host that ended.
     pub(super) fn end(&mut self, gid: Gid) {
         self.remove(gid, true);
         self.pending.ended.insert(gid);
     }
 
-    /// An endpoint of this host ended while there was no daemon, or while this daemon was new. Sessions that have not come
-    /// back yet have to hear of it, too.
+    /// Removes an endpoint of this host that ended while there was no daemon, or while this daemon was new. Sessions
+    /// that have not come back yet must be told of it, too.
     pub(super) fn bury(&mut self, gid: Gid) {
         if self.tombstones.len() == MAX_TOMBSTONES {
             self.tombstones.pop_front();
@@ -92,7 +92,7 @@ impl GraphChanges {
         self.end(gid);
     }
 
-    /// The session of an endpoint lists other peers now.
+    /// Records that the session of an endpoint now lists other peers.
     pub(super) fn regrade(&mut self, gid: Gid) {
         self.pending.regraded.insert(gid);
     }
@@ -101,7 +101,7 @@ impl GraphChanges {
         self.pending.is_empty()
     }
 
-    /// What is to be told, as the next version; `None` if nothing changed.
+    /// Takes the pending changes as the next version; `None` if nothing changed.
     pub(super) fn take(&mut self) -> Option<GraphChange> {
         if self.is_empty() {
             return None;
@@ -110,14 +110,14 @@ impl GraphChanges {
         Some(std::mem::take(&mut self.pending))
     }
 
-    /// The endpoints of whose end sessions that come back have to hear.
+    /// Returns the ended endpoints of which returning sessions must be told.
     pub(super) fn tombstones(&self) -> Vec<Gid> {
         self.tombstones.iter().copied().collect()
     }
 }
 
-/// The packets of the whole graph as each view was told it last. They live as long as a session has yet to be sent
-/// them, and as long as the graph is of their version.
+/// The packets of the whole graph for each view, as they were last made. They are kept as long as a session has yet to
+/// be sent them, and as long as the graph has their version.
 #[derive(Debug, Default)]
 pub(super) struct WholeGraphs {
     version: u64,
@@ -133,13 +133,13 @@ impl WholeGraphs {
         made.collect::<Option<Vec<_>>>().filter(|made| !made.is_empty())
     }
 
-    /// Keeps packets of the version of the last [`get`](Self::get).
+    /// Keeps packets for the version of the last [`get`](Self::get).
     pub(super) fn put(&mut self, view: GraphFilter, packets: &[Arc<[u8]>]) {
         self.by_view.insert(view, packets.iter().map(Arc::downgrade).collect());
     }
 }
 
-/// The packets of a change: each is made before the next one is put together.
+/// Makes the packets of a change, each before the next part is collected.
 pub(super) fn packets(
     version: u64,
     whole: bool,
@@ -155,7 +155,7 @@ pub(super) fn packets(
     packets
 }
 
-/// Splits a change into packets. `open` leaves `more` set in the last.
+/// Splits a change into parts. `open` sets `more` in the last part.
 pub fn parts(
     version: u64,
     whole: bool,
@@ -188,7 +188,7 @@ fn each_part(
     };
     let mut part = empty(whole);
     let mut size = 0;
-    // Removals go first: a GID that was removed and is back must end up present.
+    // Removals come first: a GID that was removed and is back must end up present.
     for gid in removed {
         if size + 34 > PART {
             each(std::mem::replace(&mut part, empty(false)));
@@ -255,7 +255,7 @@ mod tests {
         assert_eq!(change.removed(), [gid(1), gid(2)]);
         assert_eq!(change.ended, [gid(2)].into());
         assert_eq!(change.added.keys().collect::<Vec<_>>(), [&gid(1)]);
-        // Of another host, and then this host's own, or the other way round.
+        // An endpoint of another host and then of this host, and the other way round.
         changes.remove(gid(1), false);
         changes.remove(gid(2), true);
         changes.remove(gid(2), false);

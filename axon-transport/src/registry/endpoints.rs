@@ -1,4 +1,4 @@
-//! The endpoints of this host's sessions, and which of them may be pairs.
+//! The endpoints of this host's sessions, and their possible pairs.
 
 use std::collections::{BTreeSet, HashMap};
 
@@ -10,48 +10,49 @@ use crate::{
     wire::session::{EndpointRole, Pair},
 };
 
-/// An endpoint of a session here.
+/// An endpoint of a session of this host.
 #[derive(Debug)]
 pub struct LocalEndpoint {
-    /// Whose it is.
+    /// The session that owns it.
     pub session: SessionId,
     /// The endpoint.
     pub endpoint: Endpoint,
-    /// Whether it stands for itself or for others.
+    /// The role: an application's endpoint, or one that stands in for others.
     pub role: EndpointRole,
-    /// A relay's remote subscriptions.
+    /// The remote subscriptions that a relay stands for.
     pub stands_for: Vec<Gid>,
-    /// The only writer that a relay reads, where it is not all.
+    /// The only writer that a relay reads; `None` if it reads all.
     pub only: Option<Gid>,
-    /// Where a writer's ring is.
+    /// The location of a writer's ring.
     pub ring: Option<Location>,
-    /// Access rules deny it to the user whose session has it: it is in no pair with other sessions and in no graph.
+    /// True if access rules deny it to the user of its session. Then it has no pair with other sessions, and is in no
+    /// graph.
     pub denied: bool,
-    /// It has ended, but what it has written is not all in its ring yet.
+    /// True if it has ended, but not all of its messages are in its ring yet.
     pub leaving: bool,
 }
 
 impl LocalEndpoint {
-    /// Whether it is an application's that is in the graph.
+    /// Returns whether it is an application's endpoint that is in the graph.
     pub(super) fn is_shown(&self) -> bool {
         self.role == EndpointRole::Application && !self.leaving && !self.denied
     }
 
-    /// Whether one writer and one reader may be a pair, whatever their ranges, types and QoS.
+    /// Returns whether this writer and `reader` may be a pair, regardless of their ranges, types and QoS.
     pub(super) fn may_be_read_by(&self, reader: &Self) -> bool {
         let reads = reader.only.is_none_or(|only| only == self.endpoint.gid);
         reads && roles_match(self.role, reader.role) && !self.leaving && !reader.leaving
     }
 }
 
-/// A relay carries local samples away and a stand-in brings remote ones here, one of a service does
-/// both; two of them together would send a sample back to where it came from.
+/// Returns whether endpoints of these roles may be a pair. A relay carries local samples away, and a stand-in brings
+/// remote ones here; a stand-in of a service does both. A pair of two of them would send a sample back to its origin.
 fn roles_match(writer: EndpointRole, reader: EndpointRole) -> bool {
     writer == EndpointRole::Application
         || (writer == EndpointRole::StandIn && reader == EndpointRole::Application)
 }
 
-/// A topic's or service's name and type.
+/// The name and type of a topic or service.
 #[derive(Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub(super) struct Topic(String, String);
 
@@ -61,7 +62,7 @@ impl Topic {
     }
 }
 
-/// The endpoints of one topic by what they do. A client and a server do both.
+/// The writers and readers of one topic. A client or server is both.
 #[derive(Debug, Default)]
 pub(super) struct Members {
     pub(super) writers: BTreeSet<Gid>,
@@ -69,7 +70,7 @@ pub(super) struct Members {
 }
 
 impl Members {
-    /// The pairs that an endpoint of this kind makes with the others, if they go together.
+    /// Returns the pairs that an endpoint of this kind makes with the members, if they match.
     fn pairs_of(&self, gid: &Gid, kind: EndpointKind) -> Vec<Pair> {
         let mut pairs = Vec::new();
         if writes(kind) {
@@ -84,7 +85,7 @@ impl Members {
     }
 }
 
-/// The endpoints of sessions here. Each is a member of its topic, and a topic without members is forgotten.
+/// The endpoints of this host's sessions. Each is a member of its topic. A topic without members is removed.
 #[derive(Debug, Default)]
 pub(super) struct Endpoints {
     all: HashMap<Gid, LocalEndpoint>,
@@ -100,23 +101,23 @@ impl Endpoints {
         self.all.get(gid)
     }
 
-    /// Access rules deny an endpoint, or do not any more. Returns whether that is new.
+    /// Sets whether access rules deny an endpoint. Returns whether that changed.
     pub(super) fn set_denied(&mut self, gid: &Gid, denied: bool) -> bool {
         let local = self.all.get_mut(gid);
         local.is_some_and(|local| std::mem::replace(&mut local.denied, denied) != denied)
     }
 
-    /// The session that an endpoint is of.
+    /// Returns the session of an endpoint.
     pub(super) fn session_of(&self, gid: &Gid) -> Option<SessionId> {
         self.all.get(gid).map(|local| local.session)
     }
 
-    /// Whether an endpoint is here, and of another session.
+    /// Returns whether an endpoint exists and belongs to another session.
     pub(super) fn is_of_another(&self, gid: &Gid, session: &SessionId) -> bool {
         self.all.get(gid).is_some_and(|local| local.session != *session)
     }
 
-    /// The endpoints of applications that are in the graph.
+    /// Returns the endpoints of applications that are in the graph.
     pub(super) fn shown(&self) -> impl Iterator<Item = &LocalEndpoint> {
         self.all.values().filter(|local| local.is_shown())
     }
@@ -129,7 +130,7 @@ impl Endpoints {
         self.topics.values()
     }
 
-    /// Adds an endpoint whose GID no other one has.
+    /// Adds an endpoint; its GID must be new.
     pub(super) fn insert(&mut self, local: LocalEndpoint) {
         let gid = local.endpoint.gid;
         let members = self.topics.entry(Topic::of(&local.endpoint)).or_default();
@@ -142,7 +143,7 @@ impl Endpoints {
         self.all.insert(gid, local);
     }
 
-    /// Removes an endpoint. Returns it with the pairs that it may be part of.
+    /// Removes an endpoint. Returns it, with its possible pairs.
     pub(super) fn remove(&mut self, gid: &Gid) -> Option<(LocalEndpoint, Vec<Pair>)> {
         let local = self.all.remove(gid)?;
         let topic = Topic::of(&local.endpoint);
@@ -158,7 +159,7 @@ impl Endpoints {
         Some((local, pairs))
     }
 
-    /// Returns whether an endpoint stands for others now.
+    /// Sets the remote endpoints that an endpoint stands for. Returns whether they changed.
     pub(super) fn set_stands_for(&mut self, gid: &Gid, stands_for: Vec<Gid>) -> bool {
         let Some(local) = self.all.get_mut(gid) else { return false };
         let changed = local.stands_for != stands_for;
@@ -166,22 +167,22 @@ impl Endpoints {
         changed
     }
 
-    /// An endpoint has ended, or has not after all, and there is more to come of it. Returns whether that is new.
+    /// Sets whether an endpoint has ended while some of its messages are still to come. Returns whether that changed.
     pub(super) fn set_leaving(&mut self, gid: &Gid, leaving: bool) -> bool {
         let local = self.all.get_mut(gid);
         local.is_some_and(|local| std::mem::replace(&mut local.leaving, leaving) != leaving)
     }
 
-    /// The pairs that an endpoint makes at most, here or not.
+    /// Returns the possible pairs of an endpoint, which need not be added yet.
     pub(super) fn prospective_pairs(&self, endpoint: &Endpoint) -> Vec<Pair> {
         let members = self.topics.get(&Topic::of(endpoint));
         members.map(|all| all.pairs_of(&endpoint.gid, endpoint.kind)).unwrap_or_default()
     }
 
-    /// A hash of the applications' endpoints. It differs, most likely, when they change.
+    /// Returns a hash of the applications' endpoints. It most likely differs when they change.
     pub(super) fn digest(&self) -> u64 {
         self.shown().fold(0, |digest, local| {
-            // GIDs are mostly random; FNV-1a spreads the rest.
+            // GIDs are mostly random; FNV-1a mixes the other bytes.
             let hash = local.endpoint.gid.0.iter().fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| {
                 (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3)
             });
@@ -228,7 +229,7 @@ mod tests {
         assert_eq!(endpoints.prospective_pairs(&publisher), [pair(2)]);
         assert!(endpoints.remove(&gid(3)).is_none());
 
-        // A service's client and server read and write each other.
+        // A client and a server of a service read and write each other.
         let mut service = Endpoints::default();
         service.insert(application(1, EndpointKind::Client));
         service.insert(application(2, EndpointKind::Server));

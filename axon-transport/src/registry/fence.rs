@@ -14,11 +14,11 @@ use crate::{
 /// A FENCE that is not answered yet.
 #[derive(Debug)]
 struct FenceRequest {
-    /// Who asked.
+    /// The session that asked.
     by: SessionId,
     fence: Fence,
-    /// The readers' sessions that have not been sent all, and the number of the last packet that each has
-    /// to be sent: `None` while it is told everything anew.
+    /// The sessions of readers that have not been sent everything yet. Each has the number of the last packet that it
+    /// must be sent; `None` while it is sent the complete state.
     readers: Vec<(SessionId, Option<u64>)>,
 }
 
@@ -31,8 +31,8 @@ impl Fences {
         self.0.is_empty()
     }
 
-    /// Session `by` asks about the readers of its publisher. A later question about the same publisher takes the place
-    /// of an earlier one.
+    /// Adds the FENCE of session `by` for the readers of its publisher. It replaces an earlier one for the same
+    /// publisher.
     pub(super) fn ask<F>(
         &mut self,
         by: SessionId,
@@ -46,12 +46,12 @@ impl Fences {
         self.0.push(FenceRequest { by, fence, readers });
     }
 
-    /// A publisher is gone, and with it what was asked about it.
+    /// Removes the FENCE of a publisher that is gone.
     pub(super) fn forget(&mut self, writer: &Gid) {
         self.0.retain(|asked| asked.fence.writer != *writer);
     }
 
-    /// Takes those of which everything was sent by now. A session that has ended delays none.
+    /// Takes the FENCEs for which everything has been sent. A session that has ended delays no FENCE.
     pub(super) fn take_answered<F>(&mut self, sessions: &Sessions<F>) -> Vec<(SessionId, Fence)> {
         let waits = |(reader, mark): &mut (SessionId, Option<u64>)| {
             sessions.get(reader).is_some_and(|entry| !entry.outbox.was_sent(mark))
@@ -88,7 +88,7 @@ mod tests {
         Gid::new(id(session), 1)
     }
 
-    /// A KEEP_ALL publisher, a subscription that keeps all, and one that does not.
+    /// Returns a registry with a KEEP_ALL publisher, a KEEP_ALL subscription, and a KEEP_LAST one.
     fn registry() -> Registry<&'static str> {
         let mut registry = Registry::default();
         for (session, kind, qos) in [
@@ -123,7 +123,7 @@ mod tests {
         registry.handle_message(&id(WRITER), SessionMessage::Fence(fence), vec![]).unwrap();
     }
 
-    /// What was answered.
+    /// Returns the numbers of the answered FENCEs.
     fn answers(registry: &mut Registry<&'static str>) -> Vec<u64> {
         let answers = take(registry, WRITER).into_iter().filter_map(|message| match message {
             SessionMessage::Fence(fence) => Some(fence.number),
@@ -146,13 +146,13 @@ mod tests {
         ask(&mut registry, 2);
         say(&mut registry, KEEPS);
         assert_eq!(answers(&mut registry), [0; 0]);
-        // One of two; and one that could not be sent.
+        // One of two packets is sent; the second cannot be sent.
         registry.poll_output(&id(KEEPS)).unwrap();
         let unsent = registry.poll_output(&id(KEEPS)).unwrap();
         registry.return_output(&id(KEEPS), unsent);
         registry.answer_fences();
         assert_eq!(answers(&mut registry), [0; 0]);
-        // What came after the question still waits, as does all of who may lose samples.
+        // Packets after the question, and all packets of readers that may lose samples, may still wait.
         registry.poll_output(&id(KEEPS)).unwrap();
         registry.answer_fences();
         assert_eq!(answers(&mut registry), [2]);
@@ -199,7 +199,7 @@ mod tests {
         registry.handle_disconnect(&id(KEEPS));
         registry.answer_fences();
         assert_eq!(answers(&mut registry), [1]);
-        // What was asked about a publisher that is gone is forgotten.
+        // The FENCE of a publisher that is gone is removed.
         let mut registry = self::registry();
         say(&mut registry, KEEPS);
         ask(&mut registry, 1);

@@ -19,15 +19,15 @@ use crate::{
     },
 };
 
-/// How many times as many endpoints as another session the gateway's may have.
+/// Factor by which the gateway may have more endpoints than another session.
 const GATEWAYS: usize = 4;
 
 impl<F: Clone> Registry<F> {
-    /// A session whose HELLO was taken. It will be told the whole graph, or as much of it as its
-    /// `scope` lets it see; without one ranges do not apply to it.
+    /// Adds a session whose HELLO was accepted. It will be sent the whole graph, as far as its `scope` permits. Without
+    /// a `scope`, ranges do not apply to it.
     ///
     /// # Errors
-    /// When there are too many sessions.
+    /// There are too many sessions.
     pub fn handle_connect(
         &mut self,
         id: SessionId,
@@ -37,20 +37,20 @@ impl<F: Clone> Registry<F> {
         descriptors: Option<[F; 3]>,
         scope: Option<Scope>,
     ) -> Result<(), Violation> {
-        // The process of one that comes back lives.
+        // If the session comes back, its process still lives.
         while self.disconnect_in_parts(&id, true) {}
         self.sessions.insert(id, SessionEntry::new(role, name, pid, descriptors, scope))?;
         self.rescoped |= role == SessionRole::Application;
         Ok(())
     }
 
-    /// A session is of another user than the daemon's. Has to be called before it has endpoints.
+    /// Records that a session belongs to another user than the daemon's. Must be called before it has endpoints.
     pub fn set_user(&mut self, id: &SessionId, user: u32) {
         self.users.add(user);
         self.sessions.set_user(id, user);
     }
 
-    /// These access rules count from now on. Pairs that they do not allow end, and those that they allow are made.
+    /// Applies these access rules from now on. Ends pairs that they do not allow, and makes pairs that they allow.
     pub fn set_access(&mut self, rules: AccessRules) {
         self.users.set_rules(rules);
         let of_users = self.sessions.iter().filter(|(_, entry)| entry.user.is_some());
@@ -64,29 +64,29 @@ impl<F: Clone> Registry<F> {
         }
     }
 
-    /// A session that is gone, and its endpoints with it.
+    /// Removes a session that is gone, and its endpoints.
     pub fn handle_disconnect(&mut self, id: &SessionId) {
         while self.handle_disconnect_in_parts(id) {}
     }
 
-    /// As [`handle_disconnect`](Self::handle_disconnect), a part of it; whether there is more to do. The rest of
-    /// the session is told nothing any more.
+    /// Like [`handle_disconnect`](Self::handle_disconnect), but does only a part. Returns whether there is more to do.
+    /// In the meantime the session is sent nothing.
     pub fn handle_disconnect_in_parts(&mut self, id: &SessionId) -> bool {
         self.disconnect_in_parts(id, false)
     }
 
-    /// As [`handle_disconnect_in_parts`](Self::handle_disconnect_in_parts), of a session whose process may live on. What
-    /// its readers are handed once that has ended waits for [`handle_process_end`](Self::handle_process_end).
+    /// Like [`handle_disconnect_in_parts`](Self::handle_disconnect_in_parts), for a session whose process may live on.
+    /// Grants that its readers get after the process's end wait for [`handle_process_end`](Self::handle_process_end).
     pub fn handle_hang_up_in_parts(&mut self, id: &SessionId) -> bool {
         self.disconnect_in_parts(id, true)
     }
 
-    /// Whether something of a session that hung up waits for the end of its process.
+    /// Returns whether packets of a session that hung up wait for the end of its process.
     pub fn awaits_process(&self, id: &SessionId) -> bool {
         self.sessions.awaits_process(id)
     }
 
-    /// The process of a session that hung up before has ended.
+    /// Handles the end of the process of a session that hung up before.
     pub fn handle_process_end(&mut self, id: &SessionId) {
         self.sessions.process_ended(id);
     }
@@ -112,7 +112,7 @@ impl<F: Clone> Registry<F> {
         false
     }
 
-    /// The session of a publisher ends: those of its readers that would not hear of its grants are handed them.
+    /// Passes the grants of an ending publisher to those of its readers that would not be sent them otherwise.
     fn hand_over_grants(&mut self, id: &SessionId, gid: &Gid, lives: bool) {
         let Some(writer) = self.endpoints.get(gid) else { return };
         if writer.endpoint.kind != EndpointKind::Publisher || !writer.endpoint.gid.is_of(id) {
@@ -127,10 +127,10 @@ impl<F: Clone> Registry<F> {
         granted.into_iter().for_each(|granted| self.sessions.hand_over_grant(id, granted, lives));
     }
 
-    /// A message of a session.
+    /// Handles a message of a session.
     ///
     /// # Errors
-    /// When no session sends such a message; the caller disconnects it.
+    /// No session sends such a message; the caller must disconnect the session.
     pub fn handle_message(
         &mut self,
         id: &SessionId,
@@ -168,7 +168,7 @@ impl<F: Clone> Registry<F> {
             SessionMessage::Unmet(unmet) => self.unmet(id, unmet),
             SessionMessage::Unmatch(unmatch) => self.fail(id, unmatch),
             SessionMessage::Resync => {
-                // Everything costs much more to tell than to ask for.
+                // The complete state costs much more to send than to request.
                 self.sessions.request_resync(id);
                 Ok(())
             }
@@ -179,7 +179,7 @@ impl<F: Clone> Registry<F> {
     fn announce(&mut self, id: &SessionId, announce: Announce) -> Result<(), Violation> {
         let Announce { endpoint, role, stands_for, ring, only } = announce;
         let gid = endpoint.gid;
-        // A server has a ring for each of its clients, of which GRANT speaks.
+        // A server has a ring for each of its clients, which GRANT names.
         if ring.is_some() != matches!(endpoint.kind, EndpointKind::Publisher | EndpointKind::Client)
         {
             return Err(Violation::Unexpected);
@@ -266,23 +266,23 @@ impl<F: Clone> Registry<F> {
                 self.remove_endpoint(&gid, "the endpoint is gone");
                 Ok(())
             }
-            // It ended while there was no daemon. Its peers may still be attached to it, and those
-            // that have not come back yet have to hear of it too.
+            // The endpoint ended while there was no daemon. Its peers may still be attached to it, and sessions that
+            // have not come back yet must be told of it, too.
             None if gid.is_of(id) => {
                 self.changes.bury(gid);
                 Ok(())
             }
-            // A stand-in that was refused, or that another one took the place of.
+            // A stand-in that was refused, or whose GID another endpoint took over.
             None if self.sessions.get(id).is_some_and(|s| s.role == SessionRole::Gateway) => Ok(()),
             _ => Err(Violation::NotItsOwn(gid)),
         }
     }
 
-    /// Handles LEAVING. An endpoint that leaves keeps its pairs until its samples have arrived. It does not count as matched,
-    /// and is matched with no further endpoint. LEAVING can also take that back.
+    /// Handles LEAVING. An endpoint that leaves keeps its pairs until its samples have arrived. It does not count as
+    /// matched, and gets no further pairs. LEAVING can also be taken back.
     fn leave(&mut self, id: &SessionId, leave: WriterLeaving) -> Result<(), Violation> {
         let WriterLeaving { gid, leaving } = leave;
-        // It may have been refused.
+        // The endpoint may have been refused.
         let Some(local) = self.endpoints.get(&gid) else { return Ok(()) };
         if local.session != *id || !writes(local.endpoint.kind) {
             return Err(Violation::NotItsOwn(gid));
@@ -310,16 +310,17 @@ impl<F: Clone> Registry<F> {
         Ok(())
     }
 
-    /// The readers of what an endpoint writes.
+    /// Returns the readers of an endpoint's messages.
     fn readers_of(&self, writer: &LocalEndpoint) -> impl Iterator<Item = &LocalEndpoint> {
         let pairs = self.pairs.existing(self.endpoints.prospective_pairs(&writer.endpoint));
         let pairs = pairs.filter(|pair| pair.writer == writer.endpoint.gid);
         pairs.filter_map(|pair| self.endpoints.get(&pair.reader))
     }
 
-    /// A session asks whether those that may lose nothing were sent all about its publisher.
+    /// Handles FENCE: a session asks whether the readers that must lose nothing were sent everything about its
+    /// publisher.
     fn fence(&mut self, id: &SessionId, fence: Fence) -> Result<(), Violation> {
-        // It may have been refused.
+        // The publisher may have been refused.
         let Some(writer) = self.endpoints.get(&fence.writer) else { return Ok(()) };
         if writer.session != *id {
             return Err(Violation::NotItsOwn(fence.writer));
@@ -332,7 +333,7 @@ impl<F: Clone> Registry<F> {
         Ok(())
     }
 
-    /// A publisher ends, and one of its readers never took up what it was granted.
+    /// Handles UNMET: a publisher ends, and one of its readers never took up its grant.
     fn unmet(&mut self, id: &SessionId, unmet: Unmet) -> Result<(), Violation> {
         if !unmet.writer.is_of(id) {
             return Err(Violation::NotItsOwn(unmet.writer));
@@ -352,7 +353,7 @@ impl<F: Clone> Registry<F> {
         Ok(())
     }
 
-    /// Tells the writer's session what the reader asked.
+    /// Passes the reader's ATTACH to the writer's session.
     pub(super) fn forward_attach(&mut self, pair: &Pair) {
         let Some(mut attach) = self.pairs.attach_of(pair).cloned() else { return };
         let Some(to) = self.endpoints.session_of(&pair.writer) else { return };
@@ -360,7 +361,7 @@ impl<F: Clone> Registry<F> {
         self.pairs.set_told(pair, attach.stands_for.as_ref());
         let (of, lane) = (attach.session, attach.lane.segment);
         let mut descriptors = self.sessions.introduce(&to, &of, pair);
-        // The publisher looks at nothing but the lane.
+        // The publisher accesses only the lane.
         attach.segments = self.sessions.hand_over(&to, &of, [lane], &mut descriptors);
         self.push(&to, &SessionMessage::Attach(attach), descriptors);
     }
@@ -372,7 +373,7 @@ impl<F: Clone> Registry<F> {
         let pair = Pair { reader: grant.reader, writer: grant.writer };
         let grant = Granted { session: *id, segments: Vec::new(), ..grant };
         if self.pairs.attach_of(&pair).is_none() && grant.writer.is_of(id) {
-            // The reader has not come back from an earlier daemon.
+            // The reader has not come back from an earlier daemon yet.
             self.sessions.add_earlier_grant(id, grant);
         } else if self.pairs.grant(grant) {
             self.sessions.forget_earlier_grant(&pair);
@@ -381,7 +382,7 @@ impl<F: Clone> Registry<F> {
         Ok(())
     }
 
-    /// Tells the reader's session what the writer granted. Whether there was something to tell.
+    /// Passes the writer's grant to the reader's session. Returns false if there is none.
     pub(super) fn forward_grant(&mut self, pair: &Pair) -> bool {
         let Some(mut grant) = self.pairs.grant_of(pair).cloned() else { return false };
         let (Some(to), Some(writer)) =
@@ -391,7 +392,7 @@ impl<F: Clone> Registry<F> {
         };
         let (of, leaving) = (grant.session, writer.leaving);
         let mut descriptors = self.sessions.introduce(&to, &of, pair);
-        // The ring's own first: those that do not fit follow.
+        // The ring's own segment comes first. Segments that do not fit follow.
         let numbers = self.sessions.segments_for(&of, &pair.writer);
         let numbers = [grant.ring.segment].into_iter().chain(numbers);
         grant.segments = self.sessions.hand_over(&to, &of, numbers, &mut descriptors);
@@ -404,7 +405,7 @@ impl<F: Clone> Registry<F> {
         true
     }
 
-    /// A session cannot map what one of its endpoints needs of another's session.
+    /// Handles a failure: a session cannot map memory of another session that one of its endpoints needs.
     fn fail(&mut self, id: &SessionId, unmatch: Unmatch) -> Result<(), Violation> {
         let Unmatch { reader, writer, reason } = unmatch;
         let owns = |gid: &Gid| self.endpoints.session_of(gid) == Some(*id);
@@ -423,7 +424,7 @@ impl<F: Clone> Registry<F> {
              AXON_SHM=off for the process of one of them has samples pass through the daemon"
         );
         self.sessions.note_refused(id, &text);
-        // A writer may be asked again.
+        // If the writer's side failed, the pair stays: the reader may ask it again.
         if reads { self.detach(id, pair) } else { Ok(()) }
     }
 
@@ -446,7 +447,7 @@ impl<F: Clone> Registry<F> {
         Ok(())
     }
 
-    /// A relay gave up samples of a publisher, whose session is told.
+    /// Passes on to the publisher's session that a relay gave up samples.
     fn give_up(&mut self, id: &SessionId, given_up: RelayGivenUp) -> Result<(), Violation> {
         let RelayGivenUp { reader, writer, .. } = given_up;
         let relay = self.endpoints.get(&reader).filter(|e| e.role == EndpointRole::Relay);
@@ -461,7 +462,8 @@ impl<F: Clone> Registry<F> {
     }
 }
 
-/// Endpoints of one session. The gateway's are those that it has for its peers, for which it has bounds of its own.
+/// Returns the most endpoints of one session. The gateway's endpoints stand for those of its peers, and the gateway
+/// limits them per peer.
 fn most_endpoints(role: SessionRole) -> usize {
     if role == SessionRole::Gateway { GATEWAYS * LIMITS.endpoints } else { LIMITS.endpoints }
 }

@@ -1,5 +1,5 @@
-//! Makes and ends pairs, as endpoints come and go and as their ranges and the access rules change, and tells their
-//! sessions.
+//! Makes and ends pairs when endpoints come and go or their ranges or the access rules change, and sends the sessions
+//! the changes.
 
 use std::collections::{BTreeSet, HashSet};
 
@@ -14,7 +14,7 @@ use crate::{
 };
 
 impl<F: Clone> Registry<F> {
-    /// Pairs a new endpoint with what is there.
+    /// Makes the pairs of a new endpoint with the existing ones.
     pub(super) fn match_endpoint(&mut self, gid: &Gid) {
         let Some(local) = self.endpoints.get(gid) else { return };
         for pair in self.endpoints.prospective_pairs(&local.endpoint) {
@@ -23,7 +23,7 @@ impl<F: Clone> Registry<F> {
             else {
                 continue;
             };
-            // One that has come back is a pair still.
+            // The pairs of an endpoint that has come back still exist.
             if !w.may_be_read_by(r)
                 || self.pairs.contains(&pair)
                 || self.ranges().apart(w, r).is_some()
@@ -53,7 +53,7 @@ impl<F: Clone> Registry<F> {
         }
     }
 
-    /// Judges an endpoint anew.
+    /// Judges an endpoint by the current access rules.
     pub(super) fn judge(&mut self, id: &SessionId, gid: &Gid) {
         let Some(local) = self.endpoints.get(gid) else { return };
         let (endpoint, role, was_shown) = (local.endpoint.clone(), local.role, local.is_shown());
@@ -72,7 +72,7 @@ impl<F: Clone> Registry<F> {
         self.rematch(gid);
     }
 
-    /// Why access rules deny an endpoint to its user, if they do.
+    /// Returns the reason if access rules deny an endpoint to its user.
     pub(super) fn denial(
         &self,
         id: &SessionId,
@@ -83,15 +83,15 @@ impl<F: Clone> Registry<F> {
         self.users.denial(user.filter(|_| role == EndpointRole::Application), endpoint)
     }
 
-    /// Has the status and the log say that an endpoint is denied, and tells its session. REFUSED does not name the endpoint:
-    /// for a session that would be for good, and other rules may allow the endpoint.
+    /// Notes for the status and the log that an endpoint is denied, and tells its session. REFUSED does not name the
+    /// endpoint: for the session a named refusal is final, and other rules may allow the endpoint later.
     pub(super) fn note_denied(&mut self, id: &SessionId, endpoint: &Endpoint, why: &str) {
         let refused = SessionRefused::of(endpoint, why);
         self.sessions.note_refused(id, &refused.text);
         self.push(id, &SessionMessage::Refused(SessionRefused::because(refused.text)), Vec::new());
     }
 
-    /// Forgets an endpoint, which its session's entry no longer lists.
+    /// Removes an endpoint that its session's entry no longer lists, and ends its pairs.
     pub(super) fn remove_endpoint(&mut self, gid: &Gid, reason: &str) {
         let Some((local, pairs)) = self.endpoints.remove(gid) else { return };
         self.fences.forget(gid);
@@ -116,7 +116,7 @@ impl<F: Clone> Registry<F> {
         }
     }
 
-    /// Endpoints of another host came, or their range changed: what stands for them is matched anew.
+    /// Matches again the stand-ins and relays of another host's endpoints that are new or whose range changed.
     pub(super) fn rematch_remote(&mut self, endpoints: &[RemoteEndpoint]) {
         let gids: HashSet<Gid> = endpoints.iter().map(|remote| remote.endpoint.gid).collect();
         let topics: BTreeSet<_> =
@@ -133,7 +133,7 @@ impl<F: Clone> Registry<F> {
         touched.iter().for_each(|gid| self.rematch(gid));
     }
 
-    /// Ends the pairs of an endpoint that are out of range now, and makes those that are in range.
+    /// Ends the pairs of an endpoint that are now out of range, and makes the pairs that are now in range.
     pub(super) fn rematch(&mut self, gid: &Gid) {
         let Some(local) = self.endpoints.get(gid) else { return };
         let pairs = self.endpoints.prospective_pairs(&local.endpoint);
@@ -146,7 +146,8 @@ impl<F: Clone> Registry<F> {
             };
             let (to_writer, to_reader) = (w.session, r.session);
             match self.ranges().apart(w, r) {
-                // A host that is silent is not in the graph. The gateway ends its endpoints here when it is gone.
+                // The endpoints of a silent host are not in the graph. The gateway ends its stand-ins here when the
+                // host is gone.
                 Some(OutOfRange::Unknown) => {}
                 Some(why) => {
                     self.pairs.remove(&pair);
@@ -168,7 +169,7 @@ impl<F: Clone> Registry<F> {
         }
     }
 
-    /// The subscriptions that a pair's reader stands for and that the writer's session may see.
+    /// Returns the subscriptions that a pair's reader stands for and that the writer's session may see.
     pub(super) fn stands_for(&self, pair: &Pair) -> Option<Vec<Gid>> {
         let all = self.pairs.attach_of(pair)?.stands_for.clone()?;
         let writer = self.endpoints.get(&pair.writer);

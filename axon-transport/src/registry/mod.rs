@@ -60,7 +60,7 @@ pub struct Registry<F> {
     whole: WholeGraphs,
     fences: Fences,
     users: Users,
-    /// Applications' sessions came or went.
+    /// True if applications' sessions came or went.
     rescoped: bool,
 }
 
@@ -81,101 +81,102 @@ impl<F> Default for Registry<F> {
 }
 
 impl<F: Clone> Registry<F> {
-    /// The sessions.
+    /// Returns the sessions.
     pub fn sessions(&self) -> impl Iterator<Item = (&SessionId, &SessionEntry<F>)> {
         self.sessions.iter()
     }
 
-    /// One session.
+    /// Returns a session.
     pub fn session(&self, id: &SessionId) -> Option<&SessionEntry<F>> {
         self.sessions.get(id)
     }
 
-    /// A session is relayed.
+    /// Marks a session as relayed.
     pub fn set_relayed(&mut self, id: &SessionId, relay: Arc<RelayCounters>) {
         if let Some(entry) = self.sessions.get_mut(id) {
             entry.relay = Some(relay);
         }
     }
 
-    /// How many are.
+    /// Returns the number of relayed sessions.
     pub fn relayed(&self) -> usize {
         self.sessions.iter().filter(|(_, s)| s.relay.is_some()).count()
     }
 
-    /// Whether a session is told everything anew: what is pushed to it now is dropped.
+    /// Returns whether a session is being sent the complete state, or is about to be. A message that is pushed to it
+    /// may be dropped.
     pub fn is_told_anew(&self, id: &SessionId) -> bool {
         self.sessions.is_told_anew(id)
     }
 
-    /// Whether there is an application's session.
+    /// Returns whether an application has a session.
     pub fn is_needed(&self) -> bool {
         self.sessions.iter().any(|(_, s)| s.role == SessionRole::Application)
     }
 
-    /// A segment of a session's memory is not taken, since `there_are` as many as may be. The session
-    /// goes on, and is told once until it gives another one up.
+    /// Refuses a segment of a session's memory, because `there_are` as many as permitted. The session goes on. It is
+    /// told once, until it gives up another segment.
     pub fn refuse_segment(&mut self, id: &SessionId, there_are: &str) {
         self.sessions.refuse_segment(id, there_are);
     }
 
-    /// From now on keeps segments of sessions that end, `most` at a time, for readers that come back from an earlier
-    /// daemon. What is kept is given up.
+    /// Keeps up to `most` segments of sessions that end from now on, for readers that come back from an earlier daemon.
+    /// Drops the segments that were kept before.
     pub fn keep_left_memory(&mut self, most: usize) {
         self.sessions.keep_left_memory(most);
     }
 
-    /// The refused endpoints since the last call, the first of each session.
+    /// Takes the refusals since the last call, the first of each session.
     pub fn take_refused(&mut self) -> Vec<(SessionId, String)> {
         self.sessions.take_refused()
     }
 
-    /// The endpoints of sessions here.
+    /// Returns the endpoints of this host's sessions.
     pub fn endpoints(&self) -> impl Iterator<Item = &LocalEndpoint> {
         self.endpoints.iter()
     }
 
-    /// The endpoints on other hosts.
+    /// Returns the endpoints on other hosts.
     pub fn remote_endpoints(&self) -> impl Iterator<Item = (&DaemonId, &Endpoint)> {
         self.remote.iter().map(|(daemon, remote)| (daemon, &*remote.endpoint))
     }
 
-    /// The pairs whose reader has asked its writer.
+    /// Returns the ATTACH messages of the pairs whose reader has asked its writer.
     pub fn attached(&self) -> impl Iterator<Item = &Attach> {
         self.pairs.attached()
     }
 
-    /// The version that the next [`flush`](Self::flush) will exceed.
+    /// Returns the graph's version; the next [`flush`](Self::flush) exceeds it.
     pub fn version(&self) -> u64 {
         self.changes.version()
     }
 
-    /// A number that stands for the endpoints of applications here: another one, most likely, when
-    /// they change.
+    /// Returns a number that represents the applications' endpoints of this host. It most likely differs when they
+    /// change.
     pub fn digest(&self) -> u64 {
         self.endpoints.digest()
     }
 
-    /// Whether applications' sessions came or went since the last call.
+    /// Returns whether applications' sessions came or went since the last call.
     pub fn take_rescoped(&mut self) -> bool {
         std::mem::take(&mut self.rescoped)
     }
 
-    /// The scopes of applications' sessions.
+    /// Returns the scopes of applications' sessions.
     pub fn scopes(&self) -> impl Iterator<Item = &Scope> {
         let all = self.sessions.iter().map(|(_, entry)| entry);
         let applications = all.filter(|entry| entry.role == SessionRole::Application);
         applications.filter_map(|entry| entry.scope.as_ref())
     }
 
-    /// Pairs that would be matched but for the ranges of their sessions: at most `most`, of at most
-    /// `looked_at` that are looked at.
+    /// Returns pairs that would be matched except for the ranges of their sessions: at most `most`, from at most
+    /// `looked_at` candidates.
     pub fn kept_apart(&self, most: usize, looked_at: usize) -> Vec<OutOfRangePair> {
         self.ranges().kept_apart(most, looked_at)
     }
 
-    /// Links, or the addresses of static peers, changed: `listed` tells which linked peers a list of
-    /// static peers names. Pairs that are out of range now end, and those that are in range are made.
+    /// Handles changed links or changed addresses of static peers: `listed` returns the linked peers that a list of
+    /// static peers names. Ends pairs that are now out of range, and makes pairs that are now in range.
     pub fn relist(&mut self, listed: impl Fn(&[String]) -> BTreeSet<DaemonId>) {
         for id in self.sessions.relist(listed) {
             let own = self.sessions.get(&id).map(|entry| entry.endpoints.clone());
@@ -186,10 +187,9 @@ impl<F: Clone> Registry<F> {
         }
     }
 
-    /// What another host's daemon has: `reset` forgets what it had.
+    /// Adds and removes endpoints of another host's daemon. `reset` first removes all that it had.
     ///
-    /// Endpoints that are out of bounds, or whose GID another host or a session here has, are
-    /// left out.
+    /// Ignores endpoints that are out of bounds, and endpoints whose GID another host or a session of this host has.
     pub fn remote_graph(
         &mut self,
         daemon: DaemonId,
@@ -200,7 +200,7 @@ impl<F: Clone> Registry<F> {
         if reset {
             self.remote_gone(&daemon);
         }
-        // What stands for them is matched anew.
+        // The endpoints that stand for them are matched again.
         let mut changed = Vec::new();
         for gid in removed {
             if let Some(gone) = self.remote.remove(&daemon, &gid) {
@@ -216,7 +216,7 @@ impl<F: Clone> Registry<F> {
             }
             let Some(heard) = self.remote.insert(daemon, &remote) else { continue };
             if heard == RemoteChange::Range {
-                // Sessions that saw it may not see it any more.
+                // Sessions that saw the endpoint may not see it any more.
                 self.changes.remove(gid, false);
             }
             if heard != RemoteChange::Known {
@@ -227,14 +227,14 @@ impl<F: Clone> Registry<F> {
         self.rematch_remote(&changed);
     }
 
-    /// Another host's daemon is gone, and its endpoints with it.
+    /// Removes another host's daemon, which is gone, and its endpoints.
     pub fn remote_gone(&mut self, daemon: &DaemonId) {
         for gid in self.remote.remove_host(daemon) {
             self.changes.remove(gid, false);
         }
     }
 
-    /// A session's word about its own GID outweighs another host's.
+    /// Adds an endpoint of this host. If another host claimed the GID, that claim is dropped.
     fn graph_add_local(&mut self, endpoint: &Endpoint) {
         if self.remote.disown(&endpoint.gid) {
             self.changes.remove(endpoint.gid, false);

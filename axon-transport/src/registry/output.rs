@@ -1,4 +1,4 @@
-//! Tells sessions: the changes of the graph, and everything anew.
+//! Sends sessions the changes of the graph, or the complete state.
 
 use std::{collections::BTreeSet, sync::Arc};
 
@@ -12,16 +12,16 @@ use crate::{
     wire::session::{SessionGraph, SessionMessage},
 };
 
-/// Pairs of which a session is told at a time, and the rest of those of one endpoint.
+/// Number of pairs after which a part of a session's pairs ends. The pairs of one endpoint are never split.
 pub(super) const PAIRS_TOGETHER: usize = 256;
 
 impl<F: Clone> Registry<F> {
-    /// The next packet for a session; `None` when there is none.
+    /// Returns the next packet for a session; `None` if there is none.
     ///
-    /// A session that is behind is told everything anew: the graph, its matches or what was granted
-    /// to its readers, and what readers asked of its writers, closed by a GRAPH without `more`. What
-    /// it does not hear again is over. It is told a part at a time, when it has taken what waits for it:
-    /// so the parts and what changes in between come in the order in which they were so.
+    /// A session that is behind is sent the complete state: the graph, the matches of its readers or their grants, and
+    /// the requests of readers to its writers. A GRAPH without `more` closes it. Anything that the session is not sent
+    /// again has ended. It is sent one part at a time, each when the session has taken the packets that wait. So the
+    /// parts and the changes in between arrive in the order in which they happened.
     pub fn poll_output(&mut self, id: &SessionId) -> Option<SessionPacket<F>> {
         match self.sessions.get(id)?.outbox.due() {
             Some(DueMessage::Pairs) => self.tell_pairs(id),
@@ -31,24 +31,24 @@ impl<F: Clone> Registry<F> {
         self.sessions.pop(id)
     }
 
-    /// Tells a session the status, part by part, as it takes them. It need not fit the queue: a
-    /// large system's is of many megabytes.
+    /// Sends a session the status, in parts, as it takes them. It need not fit in the queue: the status of a large
+    /// system has many megabytes.
     pub fn tell_status(&mut self, id: &SessionId, text: Arc<[u8]>) {
         self.sessions.tell_status(id, text);
     }
 
-    /// Tells a session that asks once more the same status from its beginning; whether one is
-    /// being told to it.
+    /// If a status is being sent to a session that asks once more, sends it again from its beginning. Returns whether
+    /// one is.
     pub fn repeat_status(&mut self, id: &SessionId) -> bool {
         self.sessions.repeat_status(id)
     }
 
-    /// Puts a packet back that could not be sent.
+    /// Puts back a packet that could not be sent.
     pub fn return_output(&mut self, id: &SessionId, output: SessionPacket<F>) {
         self.sessions.put_back(id, output);
     }
 
-    /// Sessions that got something to be told since the last call.
+    /// Takes the sessions that got something to send since the last call.
     pub fn take_ready(&mut self) -> BTreeSet<SessionId> {
         self.sessions.take_ready()
     }
@@ -58,26 +58,26 @@ impl<F: Clone> Registry<F> {
         self.sessions.push(to, message, descriptors);
     }
 
-    /// Answers the FENCEs of which everything was sent by now. Has to be called when packets were sent, and
-    /// when sessions ended.
+    /// Answers the FENCEs for which everything has been sent. Must be called after packets were sent and after sessions
+    /// ended.
     pub fn answer_fences(&mut self) {
         for (by, fence) in self.fences.take_answered(&self.sessions) {
             self.push(&by, &SessionMessage::Fence(fence), Vec::new());
         }
     }
 
-    /// Whether there are any that wait for packets to be sent.
+    /// Returns whether any FENCE waits for packets to be sent.
     pub fn has_fences(&self) -> bool {
         !self.fences.is_empty()
     }
 
-    /// Whether [`flush`](Self::flush) has something to do.
+    /// Returns whether [`flush`](Self::flush) has something to do.
     pub fn needs_flush(&self) -> bool {
         !self.changes.is_empty()
     }
 
-    /// Queues what changed in the graph since the last call. Called a few milliseconds after a
-    /// change, so that a node that starts with twenty endpoints costs each session one packet.
+    /// Queues the changes of the graph since the last call. Called a few milliseconds after a change, so that a node
+    /// that starts with twenty endpoints costs each session one packet.
     pub fn flush(&mut self) {
         let Some(change) = self.changes.take() else { return };
         let version = self.changes.version();
@@ -98,7 +98,7 @@ impl<F: Clone> Registry<F> {
             }
             let (telling, rest): (Vec<_>, Vec<_>) =
                 sessions.into_iter().partition(|id| self.is_being_told(id));
-            // One that is being told everything takes a change as a part of the whole.
+            // For a session that is being sent the complete state, a change is part of it.
             for (sessions, open) in [(rest, false), (telling, true)] {
                 let shown = shown.iter().cloned().take_while(|_| !sessions.is_empty());
                 for packet in packets(version, false, shown, removed, &change.ended, open) {
@@ -113,7 +113,7 @@ impl<F: Clone> Registry<F> {
     }
 
     fn tell_everything(&mut self, id: &SessionId) {
-        // Pending changes are part of the whole, and the others hear of them as usual.
+        // The pending changes are part of the complete state; the other sessions get them as usual.
         self.flush();
         let packets = self.whole_graph(id);
         let Some(entry) = self.sessions.get_mut(id) else { return };
@@ -125,8 +125,8 @@ impl<F: Clone> Registry<F> {
         self.limit_queue(id);
     }
 
-    /// The whole graph as a session is shown it, open-ended: the last part says that more follows.
-    /// Sessions of one view share its packets while they are of the same version.
+    /// Returns the packets of the whole graph as a session sees it. The last part has `more` set. Sessions with the
+    /// same view share the packets while the version is the same.
     pub(super) fn whole_graph(&mut self, id: &SessionId) -> Vec<Arc<[u8]>> {
         let (view, version) = (self.ranges().view(id), self.changes.version());
         if let Some(made) = self.whole.get(version, &view) {
@@ -145,7 +145,7 @@ impl<F: Clone> Registry<F> {
         made
     }
 
-    /// Tells a session of pairs of its endpoints, some at a time, and at last that this is the whole.
+    /// Queues some pairs of a session's endpoints, and after the last ones the end of the complete state.
     fn tell_pairs(&mut self, id: &SessionId) {
         let Some(entry) = self.sessions.get_mut(id) else { return };
         entry.outbox.lift_limit();
@@ -158,7 +158,7 @@ impl<F: Clone> Registry<F> {
             let pairs: Vec<_> = self.pairs.existing(pairs).collect();
             told += pairs.len();
             for pair in pairs {
-                // A reader that is not served yet asks again; one that is learns how.
+                // A reader without a grant asks again; a reader with one is sent its grant.
                 if pair.reader == gid && !self.forward_grant(&pair) {
                     self.push(id, &SessionMessage::Match(pair), Vec::new());
                 }

@@ -1,4 +1,4 @@
-//! The pairs of writers and readers, and how far each has come.
+//! The pairs of writers and readers, and their progress.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -8,16 +8,16 @@ use crate::{
     wire::session::{Attach, Granted, Pair},
 };
 
-/// How far a pair has come.
+/// The progress of a pair.
 #[derive(Debug)]
 struct PairProgress {
-    /// The session that announced the second of the two.
+    /// The session that announced the second endpoint of the pair.
     by: SessionId,
-    /// What its reader asked.
+    /// The reader's request.
     attach: Option<Attach>,
     /// The subscriptions that the reader stands for, as last sent to the writer.
     stands_for: Option<Vec<Gid>>,
-    /// What its writer answered. A reader that asks anew is answered anew.
+    /// The writer's answer. It is removed when the reader sends another request.
     grant: Option<Granted>,
 }
 
@@ -25,7 +25,7 @@ struct PairProgress {
 #[derive(Debug, Default)]
 pub(super) struct Pairs {
     all: BTreeMap<Pair, PairProgress>,
-    /// How many each session made. No entry is zero.
+    /// The number of pairs that each session made. No entry is zero.
     made: HashMap<SessionId, usize>,
 }
 
@@ -38,13 +38,13 @@ impl Pairs {
         self.all.contains_key(pair)
     }
 
-    /// Those of some pairs that there are.
+    /// Returns those of `pairs` that exist.
     pub(super) fn existing(&self, pairs: Vec<Pair>) -> impl Iterator<Item = Pair> {
         pairs.into_iter().filter(|pair| self.contains(pair))
     }
 
-    /// Why a session's announcement may not make so many pairs, if it may not. The gateway's stand-ins are bounded by
-    /// its links, and not here.
+    /// Returns the reason if a session's announcement may not make `new` more pairs. The gateway's stand-ins are
+    /// limited by its links, not here.
     pub(super) fn refusal(&self, by: &SessionId, new: usize, is_gateway: bool) -> Option<String> {
         let made = self.made.get(by).copied().unwrap_or_default();
         if !is_gateway && made + new > MAX_PAIRS {
@@ -72,7 +72,7 @@ impl Pairs {
         *self.made.entry(by).or_default() += 1;
     }
 
-    /// Returns whether there was such a pair.
+    /// Removes a pair. Returns whether it existed.
     pub(super) fn remove(&mut self, pair: &Pair) -> bool {
         let Some(progress) = self.all.remove(pair) else { return false };
         self.uncount(&progress.by);
@@ -88,12 +88,12 @@ impl Pairs {
         }
     }
 
-    /// Stores what a reader asks. Returns whether its writer has to hear of it: a repetition is not passed on. Each
-    /// session that should know has been told, is about to be, or is behind. Sessions that are told everything anew
-    /// would otherwise set each other back without end.
+    /// Stores a reader's request. Returns whether its writer has to get it. A repetition is not passed on: each session
+    /// that needs it has been sent it, is about to be, or is behind. Sessions that are sent the complete state would
+    /// otherwise set each other back without end.
     pub(super) fn attach(&mut self, attach: Attach) -> bool {
         let pair = Pair { reader: attach.reader, writer: attach.writer };
-        // The pair may have ended while the message was on its way.
+        // The pair may have ended while the message was in flight.
         let Some(progress) = self.all.get_mut(&pair) else { return false };
         let attach = Some(attach);
         let of = |attach: &Option<Attach>| attach.clone().map(|a| Attach { after: None, ..a });
@@ -104,7 +104,7 @@ impl Pairs {
         true
     }
 
-    /// Stores what a writer grants a reader that asked. Returns whether the reader has to hear of it.
+    /// Stores a writer's grant to a reader that asked. Returns whether the reader has to get it.
     pub(super) fn grant(&mut self, grant: Granted) -> bool {
         let pair = Pair { reader: grant.reader, writer: grant.writer };
         let Some(progress) = self.all.get_mut(&pair).filter(|p| p.attach.is_some()) else {
@@ -119,29 +119,29 @@ impl Pairs {
         changed
     }
 
-    /// What a pair's reader asked.
+    /// Returns the request of a pair's reader.
     pub(super) fn attach_of(&self, pair: &Pair) -> Option<&Attach> {
         self.all.get(pair)?.attach.as_ref()
     }
 
-    /// What a pair's writer granted.
+    /// Returns the grant of a pair's writer.
     pub(super) fn grant_of(&self, pair: &Pair) -> Option<&Granted> {
         self.all.get(pair)?.grant.as_ref()
     }
 
-    /// The subscriptions that a reader stands for, as its writer was told last.
+    /// Returns the subscriptions that a reader stands for, as last sent to its writer.
     pub(super) fn told(&self, pair: &Pair) -> Option<&Vec<Gid>> {
         self.all.get(pair)?.stands_for.as_ref()
     }
 
-    /// Notes what a writer is told of the subscriptions that its reader stands for.
+    /// Records the subscriptions that a writer is told its reader stands for.
     pub(super) fn set_told(&mut self, pair: &Pair, stands_for: Option<&Vec<Gid>>) {
         if let Some(progress) = self.all.get_mut(pair) {
             progress.stands_for = stands_for.cloned();
         }
     }
 
-    /// The pairs whose reader has asked its writer.
+    /// Returns the requests of all pairs whose reader has asked its writer.
     pub(super) fn attached(&self) -> impl Iterator<Item = &Attach> {
         self.all.values().filter_map(|progress| progress.attach.as_ref())
     }
@@ -153,7 +153,7 @@ impl Pairs {
         self.all.keys()
     }
 
-    /// How many pairs a session made.
+    /// Returns the number of pairs that a session made.
     pub(super) fn made_by(&self, session: &SessionId) -> usize {
         self.made.get(session).copied().unwrap_or_default()
     }
@@ -216,7 +216,7 @@ mod tests {
         assert!(!pairs.grant(Granted { after: Some(7), ..grants(pair(1), 1) }));
         assert!(pairs.grant(grants(pair(1), 2)));
         assert_eq!(pairs.grant_of(&pair(1)).unwrap().generation, 2);
-        // A reader that asks for something else is to be answered anew.
+        // A reader that sends another request needs another answer.
         pairs.set_told(&pair(1), Some(&vec![Gid([9; 16])]));
         assert!(pairs.attach(asks(pair(1), 128)));
         assert!(pairs.grant_of(&pair(1)).is_none() && pairs.told(&pair(1)).is_none());

@@ -1,7 +1,8 @@
 //! The discovery range of each session, and the pairs and parts of the graph that follow from it.
 //!
 //! The range and the static peers belong to each session, independent of the process that started the daemon. The
-//! daemon knows from the addresses of its links which linked peers a session lists ([`Registry::relist`](super::Registry::relist)).
+//! daemon knows from the addresses of its links which linked peers a session lists
+//! ([`Registry::relist`](super::Registry::relist)).
 
 #[cfg(test)]
 mod tests;
@@ -20,28 +21,28 @@ use crate::{
     wire::session::{EndpointRole, GraphItem, Pair, SessionRole},
 };
 
-/// Which parts of the graph a session is shown. Sessions of one view are told the same.
+/// The view of a session: the parts of the graph that it sees. Sessions with equal views are sent the same.
 #[derive(Clone, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct GraphFilter {
-    /// Present where ranges apply: those of this host's registry, not those within a process.
+    /// Set if ranges apply: in this host's registry, but not in one within a process.
     scope: Option<(DiscoveryRange, Vec<DaemonId>)>,
-    /// A session that sees no other.
+    /// A session that sees no other session.
     alone: Option<SessionId>,
     gateway: bool,
-    /// Another user of this host, where access rules say what it sees.
+    /// Another user of this host, if access rules decide what it sees.
     user: Option<u32>,
 }
 
-/// A pair that would be matched but for the ranges of its sessions.
+/// A pair that would be matched except for the ranges of its sessions.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct OutOfRangePair {
     /// The topic or service.
     pub topic: String,
-    /// Its type.
+    /// The type of the topic or service.
     pub type_name: String,
     /// The pair.
     pub pair: Pair,
-    /// Why.
+    /// The reason.
     pub why: OutOfRange,
 }
 
@@ -51,7 +52,7 @@ impl GraphFilter {
     }
 }
 
-/// What the ranges of sessions allow: a look at the sessions, at their endpoints and at those of other hosts.
+/// Decides by the ranges of sessions. Borrows the sessions, their endpoints, and the endpoints of other hosts.
 pub(super) struct Ranges<'a, F> {
     pub(super) sessions: &'a Sessions<F>,
     pub(super) endpoints: &'a Endpoints,
@@ -60,20 +61,20 @@ pub(super) struct Ranges<'a, F> {
 }
 
 impl<F> Ranges<'_, F> {
-    /// The scopes of applications' sessions.
+    /// Returns the scopes of applications' sessions.
     fn scopes(&self) -> impl Iterator<Item = &Scope> {
         let all = self.sessions.iter().map(|(_, entry)| entry);
         let applications = all.filter(|entry| entry.role == SessionRole::Application);
         applications.filter_map(|entry| entry.scope.as_ref())
     }
 
-    /// Those subscriptions of other hosts that a writer's session may see.
+    /// Returns those of `all`, subscriptions of other hosts, that the writer's session may see.
     pub(super) fn seen_by(&self, writer: &LocalEndpoint, all: Vec<Gid>) -> Vec<Gid> {
         let meets = |gid: &Gid| self.apart_from(&writer.session, gid).is_none();
         all.into_iter().filter(meets).collect()
     }
 
-    /// Why the ranges of their sessions keep two endpoints apart, if they do.
+    /// Returns the reason if ranges or access rules keep two endpoints apart.
     pub(super) fn apart(&self, w: &LocalEndpoint, r: &LocalEndpoint) -> Option<OutOfRange> {
         if w.session == r.session {
             return None;
@@ -100,7 +101,7 @@ impl<F> Ranges<'_, F> {
         }
     }
 
-    /// Why a session does not meet an endpoint of another host, if it does not.
+    /// Returns the reason if a session may not meet an endpoint of another host.
     fn apart_from(&self, session: &SessionId, remote: &Gid) -> Option<OutOfRange> {
         let Some(entry) = self.sessions.get(session) else { return Some(OutOfRange::Unknown) };
         entry.scope.as_ref()?;
@@ -121,8 +122,8 @@ impl<F> Ranges<'_, F> {
         }
     }
 
-    /// An endpoint, of another host's `daemon` if there is one, as a view shows it, if it does. The
-    /// gateway is shown those of this host alone: it told of the others itself.
+    /// Returns an endpoint as a view shows it; `None` if the view does not contain it. `daemon` is set for an endpoint
+    /// of another host. The gateway sees only the endpoints of this host, because it reported the others itself.
     pub(super) fn shown_in(
         &self,
         view: &GraphFilter,
@@ -160,7 +161,7 @@ impl<F> Ranges<'_, F> {
         Some(GraphItem { endpoint: endpoint.clone(), daemon: Some(daemon), reach: None })
     }
 
-    /// The sessions that are told of the graph, by what they are shown of it.
+    /// Returns the sessions that are sent the graph, by view.
     pub(super) fn views(&self) -> BTreeMap<GraphFilter, Vec<SessionId>> {
         let mut views: BTreeMap<GraphFilter, Vec<SessionId>> = BTreeMap::new();
         for (id, entry) in self.sessions.iter() {
@@ -171,8 +172,8 @@ impl<F> Ranges<'_, F> {
         views
     }
 
-    /// Pairs that would be matched but for the ranges of their sessions: at most `most`, of at most
-    /// `looked_at` that are looked at.
+    /// Returns pairs that would be matched except for the ranges of their sessions: at most `most`, from at most
+    /// `looked_at` candidates.
     pub(super) fn kept_apart(&self, most: usize, looked_at: usize) -> Vec<OutOfRangePair> {
         let limited = self.scopes().any(|scope| scope.range != DiscoveryRange::Subnet)
             || self.users.have_rules();
@@ -193,7 +194,7 @@ impl<F> Ranges<'_, F> {
                 let session = self.sessions.get(&local.session);
                 let toward = session.and_then(|session| session.toward(daemon));
                 let why = toward.and_then(|own| out_of_range(own, remote.toward));
-                // Of a service one direction says it all.
+                // For a service, one direction suffices.
                 let remote: &Endpoint = &remote.endpoint;
                 if pairing(&local.endpoint, remote) == Pairing::Match {
                     (&local.endpoint, remote, why)

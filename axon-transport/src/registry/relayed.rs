@@ -4,10 +4,10 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use crate::status::RelayStatus;
 
-/// Bytes of the reason for which a session is relayed.
+/// Maximum length in bytes of the reason for which a session is relayed.
 pub(super) const MAX_REASON: usize = 200;
 
-/// Counts what crosses a relay's socket.
+/// Counts the samples and bytes that cross a relay's socket.
 #[derive(Debug, Default)]
 pub struct RelayCounters {
     reason: String,
@@ -19,13 +19,13 @@ pub struct RelayCounters {
 }
 
 impl RelayCounters {
-    /// Of a session that is relayed for this reason.
+    /// Creates the counters of a session that is relayed for this reason.
     pub fn new(reason: &str) -> Self {
         let reason = crate::text::plain(reason, MAX_REASON);
         Self { reason, ..Self::default() }
     }
 
-    // Relaxed throughout: each count stands for itself alone.
+    // All accesses are relaxed: the counters are independent of other memory.
 
     pub(crate) fn arrived(&self, bytes: usize) {
         self.samples_in.fetch_add(1, Ordering::Relaxed);
@@ -37,12 +37,13 @@ impl RelayCounters {
         self.bytes_out.fetch_add(bytes as u64, Ordering::Relaxed);
     }
 
-    /// Samples of the session's publishers that did not get here, or of others' that it did not take.
+    /// Counts samples of the session's publishers that did not arrive here, or samples of others that the session did
+    /// not take.
     pub fn lost(&self, samples: u64) {
         self.lost.fetch_add(samples, Ordering::Relaxed);
     }
 
-    /// As `axon status` shows it.
+    /// Returns the counters in the form that `axon status` shows.
     pub fn show(&self) -> RelayStatus {
         RelayStatus {
             reason: self.reason.clone(),

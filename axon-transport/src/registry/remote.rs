@@ -1,4 +1,4 @@
-//! The endpoints on other hosts, as their daemons told of them.
+//! The endpoints on other hosts, as their daemons reported them.
 
 use std::collections::BTreeMap;
 
@@ -7,18 +7,18 @@ use crate::{
     ids::{DaemonId, Gid},
 };
 
-/// The endpoints of other hosts, within bounds for each host. No GID is of two hosts.
+/// The endpoints of other hosts, limited per host. Each GID belongs to one host only.
 #[derive(Debug, Default)]
 pub(super) struct RemoteEndpoints(BTreeMap<DaemonId, BTreeMap<Gid, RemoteEndpoint>>);
 
-/// What is new of an endpoint that another host has.
+/// The change of an endpoint that another host reports.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum RemoteChange {
-    /// It came.
+    /// The endpoint is new.
     New,
-    /// How far it is discovered changed.
+    /// The discovery range of the endpoint changed.
     Range,
-    /// Nothing that matching depends on.
+    /// Nothing changed that matching depends on.
     Known,
 }
 
@@ -31,13 +31,13 @@ impl RemoteEndpoints {
         self.0.get(daemon)?.get(gid)
     }
 
-    /// An endpoint, on whichever host.
+    /// Finds an endpoint on any host.
     pub(super) fn find(&self, gid: &Gid) -> Option<(&DaemonId, &RemoteEndpoint)> {
         self.0.iter().find_map(|(daemon, all)| Some((daemon, all.get(gid)?)))
     }
 
-    /// A host has an endpoint. It is refused, as `None`, if it is out of bounds, if the host has as many as it may, or
-    /// if another host has it.
+    /// Adds an endpoint of a host. Refuses it with `None` if it is out of bounds, if the host has the maximum number,
+    /// or if another host has it.
     pub(super) fn insert(
         &mut self,
         daemon: DaemonId,
@@ -57,17 +57,17 @@ impl RemoteEndpoints {
         })
     }
 
-    /// A host no longer has an endpoint.
+    /// Removes an endpoint that a host no longer has.
     pub(super) fn remove(&mut self, daemon: &DaemonId, gid: &Gid) -> Option<RemoteEndpoint> {
         self.0.get_mut(daemon)?.remove(gid)
     }
 
-    /// A host is gone. Returns the GIDs that it had.
+    /// Removes a host that is gone. Returns its GIDs.
     pub(super) fn remove_host(&mut self, daemon: &DaemonId) -> impl Iterator<Item = Gid> {
         self.0.remove(daemon).unwrap_or_default().into_keys()
     }
 
-    /// No host has an endpoint, whatever their daemons say. Returns whether one had it.
+    /// Removes an endpoint from all hosts, whatever their daemons report. Returns whether a host had it.
     pub(super) fn disown(&mut self, gid: &Gid) -> bool {
         let removed = self.0.values_mut().filter_map(|all| all.remove(gid));
         removed.count() > 0

@@ -1,4 +1,4 @@
-//! Tests pairs and the graph with sessions of different ranges.
+//! Tests the pairs and the graph of sessions with different ranges.
 
 use std::collections::BTreeSet;
 
@@ -19,7 +19,7 @@ type Label = &'static str;
 
 const PEER: DaemonId = DaemonId([200; 16]);
 const OTHER: DaemonId = DaemonId([201; 16]);
-/// The static peer whose host `PEER` is.
+/// The static peer whose address is that of host `PEER`.
 const LISTED: &str = "10.0.0.2";
 const GATEWAY: u8 = 100;
 
@@ -70,13 +70,13 @@ impl World {
         gid
     }
 
-    /// The gateway's stand-in for a publisher elsewhere.
+    /// Announces the gateway's stand-in for a publisher on another host.
     fn stand_in(&mut self, remote: Gid) {
         let endpoint = Endpoint::example(remote, Publisher);
         self.announce(GATEWAY, of(endpoint, EndpointRole::StandIn, vec![]));
     }
 
-    /// The gateway's relay for subscriptions elsewhere.
+    /// Announces the gateway's relay for subscriptions on other hosts.
     fn relay(&mut self, number: u32, stands_for: Vec<Gid>) -> Gid {
         let gid = Gid::new(id(GATEWAY), number);
         let endpoint = Endpoint::example(gid, Subscription);
@@ -89,7 +89,7 @@ impl World {
         self.registry.remote_graph(daemon, false, vec![remote], vec![]);
     }
 
-    /// `PEER` is linked from where `LISTED` is.
+    /// Links `PEER` from the address `LISTED`.
     fn link(&mut self) {
         self.registry.relist(|peers| {
             peers.iter().any(|peer| peer == LISTED).then_some(PEER).into_iter().collect()
@@ -104,7 +104,7 @@ impl World {
         self.registry.pairs.keys().copied().collect()
     }
 
-    /// What a session is told of the graph by now, and whether with what it was told before.
+    /// Adds to and removes from `known` what a session is sent of the graph now.
     fn graph(&mut self, session: u8, known: &mut BTreeSet<Gid>) {
         self.registry.flush();
         for message in self.drain(session) {
@@ -169,7 +169,7 @@ fn a_localhost_session_meets_another_host_only_where_one_lists_the_other() {
         let mut world = World::new(&[scope(own, peers)]);
         world.link();
         let reader = world.own(1, 1, Subscription);
-        // In either order: they come over different ways.
+        // In either order, because the two come in different ways.
         world.stand_in(REMOTE);
         assert!(world.pairs().is_empty(), "nothing is known of it yet");
         world.remote(PEER, REMOTE, Publisher, remote);
@@ -212,7 +212,7 @@ fn pairs_outlast_the_silence_of_a_host_whose_endpoints_left_the_graph() {
     assert!(is_whole(&world));
 
     world.registry.remote_gone(&PEER);
-    // Lists change, and another subscription there joins, before anything is known of it.
+    // The lists change, and another subscription joins there, before anything is known of it.
     world.link();
     world.unlink();
     let endpoint = Endpoint::example(relay, Subscription);
@@ -244,7 +244,7 @@ fn pairs_and_graph_follow_a_link_that_comes_and_goes() {
             world.graph(session, seen);
         }
         assert!(seen[0].contains(&subscription) && !seen[1].contains(&subscription));
-        // What the gateway goes by.
+        // The information by which the gateway decides.
         world.registry.flush();
         let told = world.drain(GATEWAY);
         let reach = told.iter().rev().find_map(|message| match message {
@@ -277,7 +277,7 @@ fn a_hosts_range_for_its_own_session_is_followed() {
         assert_eq!(world.pairs().len(), usize::from(lists));
         assert_eq!(world.sees(1).contains(&REMOTE), lists);
     }
-    // Somebody else's word about it does not count.
+    // Another host's claim about it is ignored.
     world.remote(OTHER, REMOTE, Publisher, SUBNET);
     assert_eq!(world.pairs().len(), 1);
 }
@@ -324,7 +324,7 @@ fn a_publisher_counts_those_of_a_relay_that_it_meets() {
         relayed: None,
     };
     world.registry.handle_message(&id(1), SessionMessage::Grant(granted), vec![]).unwrap();
-    // The other host's session lists this host from now on.
+    // From now on the other host's session lists this host.
     world.remote(OTHER, not_met, Subscription, RangeToHost { lists: true, ..SUBNET });
     assert_eq!(stands_for(&world.drain(1)), Some(vec![met, not_met]));
     assert_eq!(world.pairs(), [Pair { reader, writer }]);

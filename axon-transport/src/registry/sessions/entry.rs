@@ -1,4 +1,4 @@
-//! One session.
+//! The entry of one session.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -17,36 +17,39 @@ use crate::{
     wire::session::SessionRole,
 };
 
-/// A session as the registry knows it.
+/// A session, with everything that the registry knows about it.
 #[derive(Debug)]
 pub struct SessionEntry<F> {
-    /// What kind it is.
+    /// The role.
     pub role: SessionRole,
-    /// Its process's name.
+    /// The name of its process.
     pub name: String,
-    /// Its process.
+    /// The id of its process.
     pub pid: u32,
-    /// Its user, where that is another than the daemon's.
+    /// Its user, if that is not the daemon's.
     pub user: Option<u32>,
-    /// How far it is discovered; `None` of the gateway, and of all in a registry within a process.
+    /// Its discovery scope; `None` for the gateway, and for all sessions in a registry within a
+    /// process.
     pub scope: Option<Scope>,
-    /// Daemons of the linked peers that it lists.
+    /// The daemons of the linked peers that it lists.
     pub lists: BTreeSet<DaemonId>,
     /// Its endpoints.
     pub endpoints: BTreeSet<Gid>,
-    /// Segment, doorbell and pidfd; a tool has none, nor has a session that nobody can meet.
+    /// Segment, doorbell and pidfd. `None` for a tool, and for a session with which no other shares
+    /// memory.
     pub descriptors: Option<[F; 3]>,
     /// The segments of its memory besides the first.
     pub segments: OwnMemory<F>,
-    /// What is shown of its relay, where it is relayed. Pairs within it are its own process's.
+    /// The counters of its relay, if it is relayed. Then pairs within the session are left to its
+    /// own process.
     pub relay: Option<Arc<RelayCounters>>,
-    /// What waits for it.
+    /// The packets that wait for it.
     pub(in crate::registry) outbox: Outbox<F>,
     /// The memory of other sessions whose descriptors it holds.
     pub(in crate::registry) held: HeldMemory,
-    /// An endpoint of its was refused.
+    /// True if one of its endpoints was refused.
     pub(in crate::registry) refused: bool,
-    /// The first of its endpoints that were refused, and why.
+    /// Its first refused endpoints, with the reasons.
     pub(in crate::registry) refused_endpoints: BTreeMap<Gid, (Endpoint, String)>,
 }
 
@@ -69,7 +72,7 @@ impl<F> SessionEntry<F> {
             descriptors,
             segments: OwnMemory::default(),
             relay: None,
-            // There is no graph that a tool could be behind with.
+            // A tool gets no graph, so it cannot be behind.
             outbox: Outbox::new(role != SessionRole::Tool),
             held: HeldMemory::default(),
             refused: false,
@@ -77,17 +80,18 @@ impl<F> SessionEntry<F> {
         }
     }
 
-    /// Packets that wait for it.
+    /// Returns the number of packets that wait for it.
     pub fn queued(&self) -> usize {
         self.outbox.len()
     }
 
-    /// The first of its endpoints that were refused, and why.
+    /// Returns its first refused endpoints, with the reasons.
     pub fn refused_endpoints(&self) -> impl Iterator<Item = (&Endpoint, &str)> {
         self.refused_endpoints.values().map(|(endpoint, why)| (endpoint, &**why))
     }
 
-    /// Its range, and the daemons of linked peers that it lists; `None` where ranges do not apply.
+    /// Returns its range and the daemons of linked peers that it lists; `None` if ranges do not
+    /// apply.
     pub(in crate::registry) fn reach(&self) -> Option<EndpointRange> {
         let scope = self.scope.as_ref()?;
         Some(EndpointRange { range: scope.range, lists: self.lists.iter().copied().collect() })

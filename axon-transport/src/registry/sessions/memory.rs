@@ -11,9 +11,9 @@ use crate::{
 /// A segment of a session's memory.
 #[derive(Clone, Debug)]
 pub struct RegisteredSegment<F> {
-    /// What it is.
+    /// The description of the segment.
     pub segment: Segment,
-    /// Its descriptor.
+    /// The descriptor of the segment.
     pub descriptor: F,
 }
 
@@ -21,16 +21,16 @@ pub struct RegisteredSegment<F> {
 #[derive(Debug)]
 pub struct OwnMemory<F> {
     segments: BTreeMap<u32, RegisteredSegment<F>>,
-    /// The session was told that no more segments are taken, and has given none up since.
+    /// True if the session was told that a segment was refused, and has given up none since.
     short: bool,
 }
 
-/// Why a segment is not taken.
+/// The reason why a segment is refused.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum NotTaken {
-    /// No session numbers a segment so.
+    /// The number is invalid.
     Number,
-    /// There are as many as may be.
+    /// The session has the maximum number of segments.
     Full,
 }
 
@@ -41,22 +41,22 @@ impl<F> Default for OwnMemory<F> {
 }
 
 impl<F> OwnMemory<F> {
-    /// The segments.
+    /// Returns the segments.
     pub fn iter(&self) -> impl Iterator<Item = &RegisteredSegment<F>> {
         self.segments.values()
     }
 
-    /// How many there are: as many descriptors of the daemon's.
+    /// Returns the number of segments. The daemon holds a descriptor for each.
     pub fn len(&self) -> usize {
         self.segments.len()
     }
 
-    /// Whether the session has its first segment alone.
+    /// Returns whether the session has only its first segment.
     pub fn is_empty(&self) -> bool {
         self.segments.is_empty()
     }
 
-    /// The segment of a number.
+    /// Returns the segment with this number.
     pub fn get(&self, number: u32) -> Option<&RegisteredSegment<F>> {
         self.segments.get(&number)
     }
@@ -73,45 +73,45 @@ impl<F> OwnMemory<F> {
         Ok(())
     }
 
-    /// Returns whether there was such a segment.
+    /// Removes a segment. Returns whether it existed.
     pub(super) fn close(&mut self, number: u32) -> bool {
         let closed = self.segments.remove(&number).is_some();
         self.short &= !closed;
         closed
     }
 
-    /// Returns whether the session has to be told that a segment is refused: once until it gives one up.
+    /// Returns whether the session has to be told that a segment is refused: once, until it gives up a segment.
     pub(super) fn note_short(&mut self) -> bool {
         !std::mem::replace(&mut self.short, true)
     }
 
-    /// The segments in which a reader of `writer` looks.
+    /// Returns the numbers of the segments that a reader of `writer` may access.
     pub(super) fn numbers_for(&self, writer: &Gid) -> Vec<u32> {
         let concerns = |s: &&RegisteredSegment<F>| s.segment.publisher.is_none_or(|p| p == *writer);
         self.iter().filter(concerns).map(|s| s.segment.number).collect()
     }
 }
 
-/// What a session holds of the memory of others.
+/// The memory of other sessions that a session holds.
 ///
-/// It holds the first descriptors of another session as long as a pair is between the two, and segments only of a
-/// session whose descriptors it holds.
+/// It holds the first descriptors of another session as long as there is a pair between the two, and further segments
+/// only of a session whose descriptors it holds.
 #[derive(Debug, Default)]
 pub(in crate::registry) struct HeldMemory(HashMap<SessionId, HeldOf>);
 
-/// What a session holds of another.
+/// The memory of one other session that a session holds.
 #[derive(Debug, Default)]
 struct HeldOf {
-    /// The pairs for which it does.
+    /// The pairs for which it holds the memory.
     pairs: HashSet<Pair>,
-    /// The numbers of the segments that it was handed.
+    /// The numbers of the segments that it was sent.
     segments: BTreeSet<u32>,
-    /// Those of them for which it asked: it may have had them before.
+    /// The segments among them for which it asked, so that it may have had them before.
     asked: BTreeSet<u32>,
 }
 
 impl HeldMemory {
-    /// The session holds another's descriptors for `pair`. Returns whether it has to be handed them.
+    /// Records that the session holds another's descriptors for `pair`. Returns whether they have to be sent.
     pub(super) fn introduce(&mut self, of: SessionId, pair: Pair) -> bool {
         let pairs = &mut self.0.entry(of).or_default().pairs;
         let first = pairs.is_empty();
@@ -119,7 +119,7 @@ impl HeldMemory {
         first
     }
 
-    /// A pair is over. With the last one the session lets go of the other's memory.
+    /// Removes a pair that has ended. With the last pair, the session no longer holds the other's memory.
     pub(super) fn forget(&mut self, of: &SessionId, pair: &Pair) {
         if let Some(held) = self.0.get_mut(of) {
             held.pairs.remove(pair);
@@ -129,29 +129,29 @@ impl HeldMemory {
         }
     }
 
-    /// The session lets go of everything.
+    /// Records that the session holds nothing any more.
     pub(in crate::registry) fn clear(&mut self) {
         self.0.clear();
     }
 
-    /// The pairs with a session whose memory it holds.
+    /// Returns the pairs for which it holds the memory of a session.
     pub(super) fn pairs_with(&self, of: &SessionId) -> impl Iterator<Item = &Pair> {
         self.0.get(of).into_iter().flat_map(|held| &held.pairs)
     }
 
-    /// Notes a segment as handed over. Returns whether it has to be.
+    /// Records a segment as sent. Returns whether it has to be sent.
     pub(super) fn hand(&mut self, of: &SessionId, number: u32) -> bool {
         self.0.get_mut(of).is_some_and(|held| held.segments.insert(number))
     }
 
-    /// The session misses a segment. Returns whether it holds the other's memory at all.
+    /// Records that the session misses a segment. Returns whether it holds the other's memory at all.
     pub(super) fn miss(&mut self, of: &SessionId, number: u32) -> bool {
         let Some(held) = self.0.get_mut(of) else { return false };
         held.segments.remove(&number);
         true
     }
 
-    /// Notes that the session asked for a segment, if it was handed that.
+    /// Records that the session asked for a segment, if it was sent that segment.
     pub(super) fn note_asked(&mut self, of: &SessionId, number: u32) {
         if let Some(held) = self.0.get_mut(of)
             && held.segments.contains(&number)
@@ -160,7 +160,7 @@ impl HeldMemory {
         }
     }
 
-    /// A segment is given up. Returns whether the session had asked for it; `None` if it was not handed it.
+    /// Removes a segment that was given up. Returns whether the session had asked for it; `None` if it was not sent it.
     pub(super) fn close(&mut self, of: &SessionId, number: u32) -> Option<bool> {
         let held = self.0.get_mut(of)?;
         held.segments.remove(&number).then(|| held.asked.remove(&number))
@@ -169,7 +169,7 @@ impl HeldMemory {
 
 #[cfg(test)]
 impl HeldMemory {
-    /// The pairs for which the session holds others' memory.
+    /// Returns the pairs for which the session holds others' memory.
     pub(in crate::registry) fn pairs(&self) -> HashMap<SessionId, HashSet<Pair>> {
         self.0.iter().map(|(of, held)| (*of, held.pairs.clone())).collect()
     }

@@ -1,4 +1,4 @@
-//! The sessions, the packets that wait for each, and the memory of others that each holds.
+//! The sessions, the packets that wait for each, and the memory of other sessions that each holds.
 //!
 //! A session that reads from another session receives its segments with objects, and the segments with samples of
 //! the publishers that it reads from. It receives existing segments with the message that introduces the two
@@ -39,11 +39,11 @@ use crate::{
 #[derive(Debug)]
 pub(super) struct Sessions<F> {
     entries: BTreeMap<SessionId, SessionEntry<F>>,
-    /// Those that got something to be told.
+    /// The sessions that got something to send.
     ready: BTreeSet<SessionId>,
-    /// The first endpoint of each session that was refused, and why.
+    /// The first refusal of each session.
     refused: Vec<(SessionId, String)>,
-    /// What they left to readers that are not here.
+    /// What sessions left for readers that are not connected.
     left: RetainedState<F>,
 }
 
@@ -71,10 +71,10 @@ impl<F> Sessions<F> {
         self.entries.get_mut(id)
     }
 
-    /// A session came. It is told everything.
+    /// Adds a session, which will be sent the complete state.
     ///
     /// # Errors
-    /// When there are too many.
+    /// There are too many sessions.
     pub(super) fn insert(
         &mut self,
         id: SessionId,
@@ -100,22 +100,22 @@ impl<F> Sessions<F> {
         self.ready.remove(id);
     }
 
-    /// From now on keeps segments of sessions that end, `most` at a time.
+    /// Keeps up to `most` segments of sessions that end from now on.
     pub(super) fn keep_left_memory(&mut self, most: usize) {
         self.left.keep_memory(most);
     }
 
-    /// Whether segments of sessions that end are kept.
+    /// Returns whether segments of sessions that end are kept.
     pub(super) fn keeps_left_memory(&self) -> bool {
         self.left.keeps_memory()
     }
 
-    /// Sessions that got something to be told since the last call.
+    /// Takes the sessions that got something to send since the last call.
     pub(super) fn take_ready(&mut self) -> BTreeSet<SessionId> {
         std::mem::take(&mut self.ready)
     }
 
-    /// Drops what waits for a session; it is told everything anew.
+    /// Drops the packets that wait for a session. It is sent the complete state instead.
     pub(super) fn fall_behind(&mut self, id: &SessionId) {
         if let Some(entry) = self.entries.get_mut(id) {
             entry.outbox.fall_behind();
@@ -123,7 +123,7 @@ impl<F> Sessions<F> {
         }
     }
 
-    /// A session asked to be told everything anew, or is shown another part of the graph now.
+    /// Sends the complete state to a session that asked for it, or whose view of the graph changed.
     pub(super) fn request_resync(&mut self, id: &SessionId) {
         if let Some(entry) = self.entries.get_mut(id) {
             entry.outbox.request_resync();
@@ -131,8 +131,8 @@ impl<F> Sessions<F> {
         }
     }
 
-    /// Links changed: `listed` tells which linked peers a list of static peers names. Returns the sessions that list
-    /// other peers now.
+    /// Handles changed links: `listed` returns the linked peers that a list of static peers names. Returns the sessions
+    /// that now list other peers.
     pub(super) fn relist(
         &mut self,
         listed: impl Fn(&[String]) -> BTreeSet<DaemonId>,
@@ -150,12 +150,12 @@ impl<F> Sessions<F> {
                 changed.push(*id);
             }
         }
-        // What they are shown of the graph is another part.
+        // Their view of the graph changed.
         changed.iter().for_each(|id| self.request_resync(id));
         changed
     }
 
-    /// Keeps the first refusal of a session for the status; it is told all of them.
+    /// Keeps the first refusal of a session for the status. The session itself is told of all.
     pub(super) fn note_refused(&mut self, id: &SessionId, text: &str) {
         if let Some(entry) = self.entries.get_mut(id)
             && !std::mem::replace(&mut entry.refused, true)
@@ -164,14 +164,14 @@ impl<F> Sessions<F> {
         }
     }
 
-    /// The refusals since the last call, the first of each session.
+    /// Takes the refusals since the last call, the first of each session.
     pub(super) fn take_refused(&mut self) -> Vec<(SessionId, String)> {
         std::mem::take(&mut self.refused)
     }
 
     /// Queues a message for one session.
     pub(super) fn push(&mut self, to: &SessionId, message: &SessionMessage, descriptors: Vec<F>) {
-        // It is told everything anew.
+        // It will be sent the complete state.
         if self.entries.get(to).is_none_or(|entry| entry.outbox.is_behind()) {
             return;
         }
@@ -180,8 +180,8 @@ impl<F> Sessions<F> {
         }
     }
 
-    /// A session turns out to be of another user than the daemon's. It is told nothing that is kept for readers of the
-    /// same session id.
+    /// Records that a session belongs to another user than the daemon's. It does not get packets that are kept for
+    /// readers with its session id.
     pub(super) fn set_user(&mut self, id: &SessionId, user: u32) {
         if let Some(entry) = self.entries.get_mut(id) {
             entry.user = Some(user);
@@ -190,7 +190,7 @@ impl<F> Sessions<F> {
         }
     }
 
-    /// Tells a reader's session of a pair that was never made. If it is not here, it is told when it comes.
+    /// Tells a reader's session of a pair that never came about. If the session is not connected, it is told later.
     pub(super) fn tell_unmet(&mut self, by: &SessionId, unmet: Unmet) {
         self.forget_earlier_grant(&Pair { reader: unmet.reader, writer: unmet.writer });
         let process = self.process_of(by);
@@ -202,7 +202,8 @@ impl<F> Sessions<F> {
     fn push_kept(&mut self, output: SessionPacket<F>) {
         let Some(reader) = output.kept_for else { return };
         let to = self.session_of(&reader);
-        // With some of them memory is handed over. An id proves nothing: a tool, or another user, may claim a reader's.
+        // Some of the packets pass memory on. An id proves nothing: a tool, or another user, may claim the id of a
+        // reader's session.
         let takes =
             |entry: &&mut SessionEntry<F>| entry.role != SessionRole::Tool && entry.user.is_none();
         match to.and_then(|id| Some((id, self.entries.get_mut(&id).filter(takes)?))) {
@@ -214,7 +215,7 @@ impl<F> Sessions<F> {
         }
     }
 
-    /// The session of an endpoint that need not have been announced: GIDs begin as their session's id does.
+    /// Returns the session of an endpoint that need not be announced: a GID begins like its session's id.
     fn session_of(&self, gid: &Gid) -> Option<SessionId> {
         let mut ends = [SessionId([0; 16]), SessionId([u8::MAX; 16])];
         ends.iter_mut().for_each(|id| id.0[..12].copy_from_slice(&gid.0[..12]));
@@ -222,7 +223,7 @@ impl<F> Sessions<F> {
         self.entries.range(first..=last).next().map(|(id, _)| *id)
     }
 
-    /// A publisher granted this by way of an earlier daemon.
+    /// Adds a grant that a publisher made through an earlier daemon.
     pub(super) fn add_earlier_grant(&mut self, by: &SessionId, granted: Granted) {
         let process = self.process_of(by);
         self.left.add_earlier_grant(granted, process);
@@ -232,12 +233,12 @@ impl<F> Sessions<F> {
         self.entries.get(id).map_or(0, |entry| entry.pid)
     }
 
-    /// A reader is granted something else, or was told that it gets nothing.
+    /// Removes the earlier grant of a reader that got another one, or was told that it gets nothing.
     pub(super) fn forget_earlier_grant(&mut self, pair: &Pair) {
         self.left.forget_earlier_grant(pair);
     }
 
-    /// A publisher has ended, and said what its readers lost.
+    /// Removes the earlier grants of a publisher that has ended and reported its readers' losses.
     pub(super) fn forget_earlier_grants(&mut self, writer: &Gid) {
         self.left.forget_earlier_grants(writer);
     }
@@ -260,7 +261,7 @@ impl<F> Sessions<F> {
         }
     }
 
-    /// The next packet that waits for a session.
+    /// Takes the next packet for a session.
     pub(super) fn pop(&mut self, id: &SessionId) -> Option<SessionPacket<F>> {
         self.entries.get_mut(id)?.outbox.pop()
     }
@@ -284,7 +285,7 @@ impl<F> Sessions<F> {
 }
 
 impl<F: Clone> Sessions<F> {
-    /// A session has one segment more. `owns` tells whether an endpoint is of a session.
+    /// Adds a segment of a session. `owns` returns whether an endpoint belongs to a session.
     pub(super) fn open_segment(
         &mut self,
         id: &SessionId,
@@ -317,8 +318,8 @@ impl<F: Clone> Sessions<F> {
         Ok(())
     }
 
-    /// A segment of a session's memory is not taken, since `there_are` as many as may be. The session
-    /// goes on, and is told once until it gives another one up.
+    /// Refuses a segment of a session's memory, because `there_are` as many as permitted. The session goes on. It is
+    /// told once, until it gives up another segment.
     pub(super) fn refuse_segment(&mut self, id: &SessionId, there_are: &str) {
         let Some(entry) = self.entries.get_mut(id) else { return };
         if !entry.segments.note_short() {
@@ -332,17 +333,17 @@ impl<F: Clone> Sessions<F> {
         self.push(id, &SessionMessage::Refused(SessionRefused::because(text)), Vec::new());
     }
 
-    /// A session ends. Hands its earlier grants to the readers. Called before its pairs end.
+    /// Passes the earlier grants of a session that ends to the readers. Called before its pairs end.
     pub(super) fn hand_over_earlier_grants(&mut self, id: &SessionId, lives: bool) {
         let grants = self.left.take_earlier_grants(id);
         grants.into_iter().for_each(|granted| self.hand_over_grant(id, granted, lives));
     }
 
-    /// Hands what a session that ends granted to a reader, and its ring. If its process still `lives`, this waits for the
-    /// process's end: the session may come back, and the ring may be written.
+    /// Passes the grant of a session that ends to a reader, with the ring. If the session's process still `lives`, this
+    /// waits for the process's end: the session may come back, and may still write the ring.
     pub(super) fn hand_over_grant(&mut self, id: &SessionId, granted: Granted, lives: bool) {
         let Some(entry) = self.entries.get(id) else { return };
-        // The memory of a relayed session is the daemon's, which outlives it.
+        // The daemon has the memory of a relayed session, and keeps it after the session's end.
         let lives = lives && entry.relay.is_none();
         for output in packets_of_grant(entry, granted) {
             if lives {
@@ -353,22 +354,22 @@ impl<F: Clone> Sessions<F> {
         }
     }
 
-    /// Whether something waits for the end of a session's process.
+    /// Returns whether packets wait for the end of a session's process.
     pub(super) fn awaits_process(&self, id: &SessionId) -> bool {
         self.left.awaits_process(id)
     }
 
-    /// The process of a session that ended before has ended, too.
+    /// Handles the end of the process of a session that ended before.
     pub(super) fn process_ended(&mut self, id: &SessionId) {
         self.left.take_awaiting(id).into_iter().for_each(|output| self.push_kept(output));
     }
 
-    /// Whether a reader's session is told everything anew, and so not what was granted before.
+    /// Returns whether a reader's session is sent the complete state, which does not contain earlier grants.
     pub(super) fn is_told_anew(&self, id: &SessionId) -> bool {
         self.entries.get(id).is_some_and(|entry| entry.outbox.mark().is_none())
     }
 
-    /// A session has given a segment up.
+    /// Removes a segment that a session has given up.
     pub(super) fn close_segment(&mut self, id: &SessionId, number: u32) {
         if !self.entries.get_mut(id).is_some_and(|entry| entry.segments.close(number)) {
             return;
@@ -376,8 +377,8 @@ impl<F: Clone> Sessions<F> {
         let mut told = Vec::new();
         for (reader, entry) in &mut self.entries {
             let Some(asked) = entry.held.close(id, number) else { continue };
-            // A session that has not taken it, as that of a stopped process, need not hear of it, nor keep its memory.
-            // One that asked for it may have it from before, and then keeps it until it hears.
+            // A session that has not taken the segment yet (its process may be stopped) need not be told, and need not
+            // get the memory. A session that asked for it may have it from before, and keeps it until it is told.
             if !entry.outbox.take_back(id, number) || asked {
                 told.push(*reader);
             }
@@ -388,7 +389,7 @@ impl<F: Clone> Sessions<F> {
         }
     }
 
-    /// A session misses a segment of another, which it reads from.
+    /// Sends a segment that a session misses. The session reads from the segment's owner.
     pub(super) fn need_segment(&mut self, id: &SessionId, of: &SessionId, number: u32) {
         if !self.entries.get_mut(id).is_some_and(|entry| entry.held.miss(of, number)) {
             return self.hand_left(id, of, number);
@@ -399,7 +400,7 @@ impl<F: Clone> Sessions<F> {
         }
     }
 
-    /// A session that this daemon has not introduced to `of` misses a segment of that session: it knows it from an
+    /// Sends a segment to a session that this daemon has not introduced to `of`: the session knows the segment from an
     /// earlier daemon.
     fn hand_left(&mut self, id: &SessionId, of: &SessionId, number: u32) {
         if !self.keeps_left_memory() {
@@ -415,12 +416,12 @@ impl<F: Clone> Sessions<F> {
         self.push(id, &SessionMessage::Segment(opened), vec![descriptor]);
     }
 
-    /// The segments of session `of` in which a reader of `writer` looks.
+    /// Returns the numbers of the segments of session `of` that a reader of `writer` may access.
     pub(super) fn segments_for(&self, of: &SessionId, writer: &Gid) -> Vec<u32> {
         self.entries.get(of).map(|entry| entry.segments.numbers_for(writer)).unwrap_or_default()
     }
 
-    /// Adds the descriptors of those segments that `to` lacks, as many as go into one packet.
+    /// Adds the descriptors of those segments that `to` lacks, as many as fit in one packet.
     pub(super) fn hand_over(
         &mut self,
         to: &SessionId,
@@ -443,7 +444,7 @@ impl<F: Clone> Sessions<F> {
         handed
     }
 
-    /// Hands over the segments that the packet had no room for.
+    /// Sends the segments for which the packet had no room.
     pub(super) fn hand_over_rest(&mut self, to: &SessionId, of: &SessionId, writer: &Gid) {
         for number in self.segments_for(of, writer) {
             self.hand(to, of, number);
@@ -459,7 +460,7 @@ impl<F: Clone> Sessions<F> {
         }
     }
 
-    /// Marks a segment of `of` as handed to `to`, and returns it. `None`: `to` has it.
+    /// Marks a segment of `of` as sent to `to`, and returns it; `None` if `to` has it.
     fn take_if_missing(
         &mut self,
         to: &SessionId,
@@ -470,7 +471,7 @@ impl<F: Clone> Sessions<F> {
         self.entries.get_mut(to)?.held.hand(of, number).then_some(segment)
     }
 
-    /// The descriptors of `of` when `to` holds none yet, and notes that it does for `pair`.
+    /// Returns the descriptors of `of` if `to` holds none yet, and records that `to` holds them for `pair`.
     pub(super) fn introduce(&mut self, to: &SessionId, of: &SessionId, pair: &Pair) -> Vec<F> {
         if to == of {
             return Vec::new();
@@ -482,7 +483,7 @@ impl<F: Clone> Sessions<F> {
         if entry.held.introduce(*of, *pair) { descriptors.into() } else { Vec::new() }
     }
 
-    /// Two sessions are about to be told that `pair`, for which they held each other's descriptors, is over.
+    /// Records for two sessions that `pair`, for which they held each other's descriptors, ends.
     pub(super) fn part(&mut self, pair: &Pair, one: &SessionId, other: &SessionId) {
         for (at, of) in [(one, other), (other, one)] {
             if let Some(entry) = self.entries.get_mut(at) {
@@ -492,12 +493,12 @@ impl<F: Clone> Sessions<F> {
     }
 }
 
-/// The packet of a message.
+/// Encodes a message as a packet.
 pub(super) fn encode(message: &SessionMessage) -> Option<Arc<[u8]>> {
     match message.encode() {
         Ok(packet) => Some(packet.into()),
         Err(error) => {
-            // Everything that is stored is small enough to be passed on.
+            // Everything that the registry stores is small enough for a packet.
             tracing::error!(%error, "a control message could not be encoded");
             None
         }

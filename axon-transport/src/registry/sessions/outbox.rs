@@ -1,4 +1,4 @@
-//! The packets that wait for one session, and the parts of a report that it is still to be told.
+//! The packets that wait for one session, and the remaining parts of a status that it is sent.
 
 use std::{collections::VecDeque, sync::Arc};
 
@@ -9,28 +9,28 @@ use crate::{
     wire::session::{SessionMessage, StatusPart},
 };
 
-/// Packets that stay for their readers that may wait for one session.
+/// Most kept packets (for readers) that may wait for one session.
 const MAX_WAITING_KEPT: usize = 1024;
 
 /// A packet for a session.
 #[derive(Clone, Debug)]
 pub struct SessionPacket<F> {
-    /// Its bytes.
+    /// The encoded message.
     pub packet: Arc<[u8]>,
-    /// What goes with it.
+    /// The descriptors that go with it.
     pub descriptors: Vec<F>,
-    /// The session's segment that it hands over and nothing else.
+    /// The segment that it passes on, if that is all it does.
     segment: Option<(SessionId, u32)>,
-    /// The reader of the session's that it is for, where the session would not hear of it when it is told everything anew.
+    /// Set if the packet is kept for this reader of the session, because the complete state does not contain it.
     pub(in crate::registry) kept_for: Option<Gid>,
-    /// The process whose publisher it is of, where it stays for its reader.
+    /// For a kept packet: the process of the publisher.
     pub(super) process: u32,
-    /// Which it is of the packets that were queued for its session; 0 before it is.
+    /// The number of the packet among those queued for its session; 0 before it is queued.
     number: u64,
 }
 
 impl<F> SessionPacket<F> {
-    /// A message that does not fit is left out: everything that is stored is small enough to be passed on.
+    /// Encodes a message. Returns `None` if it is too large; everything that the registry stores is small enough.
     pub(super) fn of(message: &SessionMessage, descriptors: Vec<F>) -> Option<Self> {
         let segment = match message {
             SessionMessage::Segment(opened) => Some((opened.session, opened.segment.number)),
@@ -46,7 +46,8 @@ impl<F> SessionPacket<F> {
         })
     }
 
-    /// A packet of a publisher of `process` that stays for its reader whatever becomes of the session's queue.
+    /// Creates a packet about a publisher of `process`, which is kept for its reader whatever happens to the session's
+    /// queue.
     pub(super) fn kept(
         message: &SessionMessage,
         descriptors: Vec<F>,
@@ -56,7 +57,7 @@ impl<F> SessionPacket<F> {
         Some(Self { kept_for: Some(reader), process, ..Self::of(message, descriptors)? })
     }
 
-    /// A packet without descriptors.
+    /// Creates a packet without descriptors.
     pub(super) fn plain(packet: Arc<[u8]>) -> Self {
         Self {
             packet,
@@ -69,49 +70,49 @@ impl<F> SessionPacket<F> {
     }
 }
 
-/// What a session with an empty queue is told next.
+/// What a session with an empty queue is sent next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(in crate::registry) enum DueMessage {
-    /// Everything, from the beginning.
+    /// The complete state, from its beginning.
     Everything,
-    /// More of the pairs of its endpoints.
+    /// Further pairs of its endpoints.
     Pairs,
 }
 
-/// What came of a packet for a session.
+/// The result of queueing a packet.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Pushed {
     Queued,
-    /// The session is behind: it is told everything anew.
+    /// The session is behind and will be sent the complete state.
     Behind,
     /// The queue is full.
     Full,
 }
 
-/// The packets for one session, in order, within bounds of their number and bytes.
+/// The packets for one session, in order, with limits on their number and bytes.
 ///
-/// A session that does not take its packets in time falls *behind*: its queue is dropped but for what it would not hear
-/// again ([`push_kept`](Self::push_kept)), nothing else is queued for it, and it is told everything anew once it reads
-/// again. While it is told everything the bounds grow with what it has to hear.
+/// A session that does not take its packets in time falls *behind*. Its queue is then dropped, except for kept packets
+/// ([`push_kept`](Self::push_kept)), which it would not be sent again. Nothing else is queued for it until it reads
+/// again, and then it is sent the complete state. Meanwhile the limits grow with the complete state.
 #[derive(Debug)]
 pub(in crate::registry) struct Outbox<F> {
     queue: VecDeque<SessionPacket<F>>,
-    /// How many of them stay whatever becomes of the rest. They have a bound of their own.
+    /// The number of kept packets in the queue. They have their own limit.
     kept: usize,
     /// The number of the last packet that was queued.
     last_queued: u64,
     max_packets: usize,
-    /// The sum over the queue.
+    /// The bytes of all packets in the queue.
     bytes: usize,
     max_bytes: usize,
-    /// Whether the session is told of the graph. One that is not cannot be behind.
+    /// True if the session gets the graph. Otherwise it cannot be behind.
     hears_graph: bool,
     behind: bool,
-    /// It asked to be told everything anew, and is once it has taken what waits for it.
+    /// True if it asked for the complete state. It is sent that after the packets that wait.
     resync: bool,
-    /// Its endpoints whose pairs it is still to be told of, while it is told everything.
+    /// While the complete state is sent: the endpoints whose pairs it has yet to be sent.
     telling: Option<Vec<Gid>>,
-    /// What it asked about, and the next part of it.
+    /// The status that it asked for, and the number of the next part.
     status: Option<(Arc<[u8]>, u32)>,
 }
 
@@ -132,27 +133,27 @@ impl<F> Outbox<F> {
         }
     }
 
-    /// Packets that wait.
+    /// Returns the number of packets that wait.
     pub(super) fn len(&self) -> usize {
         self.queue.len()
     }
 
-    /// Whether the queue was dropped, and the session has not begun to hear everything anew.
+    /// Returns whether the queue was dropped and the complete state has not been started.
     pub(in crate::registry) fn is_behind(&self) -> bool {
         self.behind
     }
 
-    /// Whether it is being told everything.
+    /// Returns whether the complete state is being sent.
     pub(in crate::registry) fn is_being_told(&self) -> bool {
         self.telling.is_some()
     }
 
-    /// Whether it is told everything from the beginning, or is about to be.
+    /// Returns whether the complete state is being sent or about to be.
     fn is_told_anew(&self) -> bool {
         self.behind || self.resync || self.telling.is_some()
     }
 
-    /// Queues a packet. After [`Pushed::Full`] the session has to [`fall_behind`](Self::fall_behind).
+    /// Queues a packet. After [`Pushed::Full`], the caller must call [`fall_behind`](Self::fall_behind).
     pub(super) fn push(&mut self, output: SessionPacket<F>) -> Pushed {
         if self.behind {
             return Pushed::Behind;
@@ -166,8 +167,8 @@ impl<F> Outbox<F> {
         Pushed::Queued
     }
 
-    /// Queues what the session would not hear of otherwise: it stays if the session falls behind. Beyond the bound the
-    /// process that said most of it loses the oldest.
+    /// Queues a packet that the session would not be sent otherwise; it is kept if the session falls behind. Beyond the
+    /// limit, the process with the most kept packets loses its oldest one.
     pub(super) fn push_kept(&mut self, output: SessionPacket<F>) {
         if self.kept == MAX_WAITING_KEPT {
             self.make_room(output.process);
@@ -193,7 +194,7 @@ impl<F> Outbox<F> {
         );
     }
 
-    /// Takes back what stays for its readers.
+    /// Removes and returns the kept packets.
     pub(super) fn take_kept(&mut self) -> Vec<SessionPacket<F>> {
         let is_kept = |output: &SessionPacket<F>| output.kept_for.is_some();
         let (taken, rest): (VecDeque<_>, _) =
@@ -205,12 +206,12 @@ impl<F> Outbox<F> {
         taken
     }
 
-    /// Takes what stays for its readers, of a session that is gone.
+    /// Returns the kept packets of a session that is gone.
     pub(super) fn into_kept(self) -> impl Iterator<Item = SessionPacket<F>> {
         self.queue.into_iter().filter(|output| output.kept_for.is_some())
     }
 
-    /// What has to be queued before the next [`pop`](Self::pop).
+    /// Returns what has to be queued before the next [`pop`](Self::pop).
     pub(in crate::registry) fn due(&self) -> Option<DueMessage> {
         if !self.queue.is_empty() {
             None
@@ -221,7 +222,7 @@ impl<F> Outbox<F> {
         }
     }
 
-    /// The next packet, or the next part of a status.
+    /// Takes the next packet, or the next part of a status.
     pub(super) fn pop(&mut self) -> Option<SessionPacket<F>> {
         let output = self.queue.pop_front();
         self.bytes -= output.as_ref().map_or(0, |output| output.packet.len());
@@ -233,7 +234,7 @@ impl<F> Outbox<F> {
         output.or_else(|| self.next_part())
     }
 
-    /// Puts a packet back that could not be sent.
+    /// Puts back a packet that could not be sent.
     pub(super) fn put_back(&mut self, output: SessionPacket<F>) {
         if SessionMessage::is_status(&output.packet) {
             if let Some((_, next)) = &mut self.status {
@@ -246,7 +247,7 @@ impl<F> Outbox<F> {
         }
     }
 
-    /// Takes back what hands a segment over and still waits. Returns whether there was any.
+    /// Removes waiting packets that pass a segment on. Returns whether there were any.
     pub(in crate::registry) fn take_back(&mut self, of: &SessionId, number: u32) -> bool {
         let before = self.queue.len();
         self.queue.retain(|output| output.segment != Some((*of, number)));
@@ -257,7 +258,7 @@ impl<F> Outbox<F> {
         taken
     }
 
-    /// Drops what waits; the session is told everything anew.
+    /// Drops the waiting packets except for kept ones. The session is sent the complete state instead.
     pub(super) fn fall_behind(&mut self) {
         self.behind = self.hears_graph;
         self.telling = None;
@@ -265,13 +266,13 @@ impl<F> Outbox<F> {
         self.bytes = self.queue.iter().map(|output| output.packet.len()).sum();
     }
 
-    /// The session is told everything anew once it has taken what waits.
+    /// Sends the session the complete state after the packets that wait.
     pub(in crate::registry) fn request_resync(&mut self) {
         self.resync = true;
     }
 
-    /// Begins to tell everything: the pairs of `endpoints` follow what is queued now. The queue has no bound until
-    /// [`limit`](Self::limit).
+    /// Begins to send the complete state: the pairs of `endpoints` follow the packets queued now. The queue has no
+    /// limit until [`limit`](Self::limit).
     pub(in crate::registry) fn begin_telling(&mut self, endpoints: Vec<Gid>) {
         self.behind = false;
         self.resync = false;
@@ -279,7 +280,8 @@ impl<F> Outbox<F> {
         self.lift_limit();
     }
 
-    /// The next endpoint whose pairs the session is told. After the last one it is no longer being told everything.
+    /// Takes the next endpoint whose pairs the session is sent. Returns `None` after the last one, which ends the
+    /// complete state.
     pub(in crate::registry) fn next_endpoint(&mut self) -> Option<Gid> {
         let next = self.telling.as_mut().and_then(Vec::pop);
         if next.is_none() {
@@ -288,24 +290,24 @@ impl<F> Outbox<F> {
         next
     }
 
-    /// The queue has no bound until [`limit`](Self::limit).
+    /// Removes the limits of the queue until [`limit`](Self::limit).
     pub(in crate::registry) fn lift_limit(&mut self) {
         self.max_packets = usize::MAX;
         self.max_bytes = usize::MAX;
     }
 
-    /// As much as usual may wait besides what waits now.
+    /// Permits the usual number of packets and bytes in addition to those that wait now.
     pub(in crate::registry) fn limit(&mut self) {
         self.max_packets = self.queue.len() + MAX_QUEUE;
         self.max_bytes = self.bytes + MAX_QUEUE_BYTES;
     }
 
-    /// Tells a status, part by part. It need not fit the queue: a large system's is of many megabytes.
+    /// Sends a status in parts. It need not fit in the queue: the status of a large system has many megabytes.
     pub(super) fn tell_status(&mut self, text: Arc<[u8]>) {
         self.status = Some((text, 0));
     }
 
-    /// Tells the same status from its beginning. Returns whether one is being told.
+    /// Sends the same status again from its beginning. Returns whether one is being sent.
     pub(super) fn repeat_status(&mut self) -> bool {
         self.status.as_mut().is_some_and(|(_, next)| {
             *next = 0;
@@ -313,7 +315,7 @@ impl<F> Outbox<F> {
         })
     }
 
-    /// The next part of a status. A status without text has one part, too.
+    /// Returns the next part of a status. An empty status has one part, too.
     fn next_part(&mut self) -> Option<SessionPacket<F>> {
         let (text, next) = self.status.as_mut()?;
         let parts = u32::try_from(text.len().div_ceil(STATUS_SLICE).max(1)).ok()?;
@@ -328,14 +330,14 @@ impl<F> Outbox<F> {
         SessionPacket::of(&part, Vec::new())
     }
 
-    /// The number of the packet up to which all has to be sent before a FENCE of now is answered; `None` while the
-    /// session is told everything anew.
+    /// Returns the number of the packet up to which everything has to be sent before a FENCE that comes now is
+    /// answered; `None` while the session is sent the complete state.
     pub(in crate::registry) fn mark(&self) -> Option<u64> {
         (!self.is_told_anew()).then_some(self.last_queued)
     }
 
-    /// Whether all up to a [`mark`](Self::mark) was sent. If the session is told everything anew, it has to be sent all
-    /// of that.
+    /// Returns whether everything up to a [`mark`](Self::mark) was sent. If the session is sent the complete state, the
+    /// mark moves to the end of that.
     pub(in crate::registry) fn was_sent(&self, mark: &mut Option<u64>) -> bool {
         if self.is_told_anew() {
             *mark = None;
@@ -348,7 +350,7 @@ impl<F> Outbox<F> {
 
 #[cfg(test)]
 impl<F> Outbox<F> {
-    /// Checks the bounds and the sum, and returns the bytes that wait.
+    /// Checks the limits and the sum, and returns the bytes that wait.
     pub(in crate::registry) fn check(&self) -> usize {
         let kept = self.queue.iter().filter(|output| output.kept_for.is_some());
         assert_eq!(self.kept, kept.count());
@@ -461,7 +463,7 @@ mod tests {
         assert!(outbox.was_sent(&mut mark), "the later packet does not count");
         outbox.put_back(first);
         assert!(!outbox.was_sent(&mut mark), "it could not be sent");
-        // What was told before is told anew: the mark moves to the end of that.
+        // The complete state replaces the packets, so the mark moves to its end.
         outbox.fall_behind();
         assert!(!outbox.was_sent(&mut mark));
         assert_eq!(mark, None);

@@ -1,10 +1,11 @@
-//! Who makes room in a table that is full: the process that has most in it. So a process that fills it displaces what is
-//! its own, and nothing of another one. A session counts for its process, since a process may have many.
+//! Chooses the entry that makes room in a full table: one of the process with the most entries. So a process that fills
+//! the table displaces only its own entries. Entries count per process and not per session, because a process may have
+//! many sessions.
 
 use std::collections::HashMap;
 
-/// The place of the entry that makes room for one more of process `newcomer`: the oldest of the process that has most
-/// then. `processes` are those of the entries, the oldest first.
+/// Returns the index of the entry that makes room for one more of process `newcomer`: the oldest of the process that
+/// then has the most. `processes` are the processes of the entries, the oldest first.
 pub(super) fn makes_room(
     processes: impl Iterator<Item = u32> + Clone,
     newcomer: u32,

@@ -109,7 +109,7 @@ fn a_sample_never_goes_back_to_where_it_came_from() {
         Pair { reader: relay.gid, writer: talker.gid },
     ];
     assert_eq!(pairs.iter().collect::<BTreeSet<_>>(), expected.iter().collect());
-    // Neither is an endpoint of this host in the eyes of its sessions.
+    // Sessions see neither of them as an endpoint of this host.
     world.registry.flush();
     let shown: BTreeSet<Gid> = world
         .registry
@@ -165,7 +165,7 @@ fn a_gid_in_use_cannot_be_claimed_by_another_host() {
     world.registry.remote_graph(b, true, vec![local.clone(), remote.clone()], vec![]);
     let of: Vec<_> = world.registry.remote_endpoints().map(|(d, e)| (*d, e.gid)).collect();
     assert_eq!(of, [(a, remote.gid)]);
-    // Nor can the one take away what is the other's.
+    // Nor can one host remove an endpoint of the other.
     world.registry.remote_graph(b, false, Vec::<Endpoint>::new(), vec![remote.gid]);
     assert_eq!(world.registry.remote_endpoints().count(), 1);
 }

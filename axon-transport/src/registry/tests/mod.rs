@@ -20,7 +20,7 @@ use crate::{
     },
 };
 
-/// A descriptor in these tests: whose it is, and which.
+/// A descriptor in these tests: the session that owns it, and its name.
 type Label = (SessionId, &'static str);
 
 fn session_id(number: u8) -> SessionId {
@@ -47,7 +47,7 @@ fn announce_as(endpoint: Endpoint, role: EndpointRole) -> SessionMessage {
     SessionMessage::Endpoint(Announce { endpoint, role, stands_for: vec![], ring, only: None })
 }
 
-/// A session that does what the client does, without rings.
+/// A session that behaves like the client, without rings.
 #[derive(Debug, Default)]
 struct Client {
     id: SessionId,
@@ -56,11 +56,11 @@ struct Client {
     endpoints: BTreeMap<Gid, Endpoint>,
     attached: BTreeSet<Pair>,
     held: HashMap<SessionId, HashSet<Pair>>,
-    /// Segments of its own, and those of the sessions that it holds.
+    /// Its own segments, and those of the sessions whose memory it holds.
     segments: BTreeMap<u32, Segment>,
     mapped: HashMap<SessionId, BTreeSet<u32>>,
-    /// Those of them that were handed over since the daemon began to tell everything anew. It does not say when others
-    /// are gone.
+    /// The segments that were sent since the daemon began to send the complete state. The daemon does not report that
+    /// others are gone.
     named: HashMap<SessionId, BTreeSet<u32>>,
     graph: BTreeMap<Gid, Option<DaemonId>>,
     building: Option<BTreeMap<Gid, Option<DaemonId>>>,
@@ -87,7 +87,7 @@ impl Client {
             return;
         }
         let pairs = self.held.entry(of).or_default();
-        // The grant of a session that has ended is kept for its reader, and comes with all that the reader may lack.
+        // The grant of a session that has ended is kept for its reader, and brings everything that the reader may lack.
         if pairs.is_empty() || output.kept_for.is_some() {
             assert_eq!(came, handed(of), "descriptors that are needed");
         } else {
@@ -243,7 +243,7 @@ enum Step {
         remove: u8,
     },
     RemoteGone(u8),
-    /// More memory, of all publishers or of one.
+    /// The session opens a segment, for all publishers or for one.
     Open {
         session: u8,
         which: Option<prop::sample::Index>,
@@ -252,7 +252,7 @@ enum Step {
         session: u8,
         which: prop::sample::Index,
     },
-    /// Asks for a segment of another that may be there or not.
+    /// The session asks for a segment of another session, which may exist or not.
     Need {
         session: u8,
         of: u8,
@@ -469,7 +469,7 @@ impl World {
 }
 
 impl World {
-    /// A reader has all the memory in which its writer's samples may be.
+    /// Checks that a reader has all the memory that may contain its writer's samples.
     fn check_mapped(&self, client: &Client, pair: &Pair) {
         let owner = |c: &&Client| c.endpoints.contains_key(&pair.writer);
         let of = self.clients.values().find(owner).expect("a writer that is attached to");

@@ -30,7 +30,7 @@ fn unmet(samples: u64) -> Unmet {
 fn connect(registry: &mut Registry<&'static str>, session: u8) {
     let handed = Some(["segment", "doorbell", "pidfd"]);
     let (role, name) = (SessionRole::Application, String::new());
-    // Each is a process of its own.
+    // Each session has its own process.
     registry.handle_connect(id(session), role, name, session.into(), handed, None).unwrap();
 }
 
@@ -45,7 +45,7 @@ fn say(registry: &mut Registry<&'static str>, message: SessionMessage) {
     registry.handle_message(&id(WRITER), message, vec![]).unwrap();
 }
 
-/// The publisher is announced.
+/// Announces the publisher.
 fn announce(registry: &mut Registry<&'static str>) {
     let endpoint = Endpoint::example(unmet(0).writer, EndpointKind::Publisher);
     let (role, stands_for) = (EndpointRole::Application, Vec::new());
@@ -59,7 +59,7 @@ fn taken(registry: &mut Registry<&'static str>, session: u8) -> Vec<SessionMessa
     taken.map(|output| SessionMessage::decode(&output.packet).unwrap()).collect()
 }
 
-/// What the reader's session is told of unmet pairs.
+/// Returns the sample counts of the unmet pairs that the reader's session is told.
 fn told(registry: &mut Registry<&'static str>) -> Vec<u64> {
     let samples = taken(registry, READER).into_iter().filter_map(|message| match message {
         SessionMessage::Unmet(unmet) => Some(unmet.samples),
@@ -141,7 +141,8 @@ fn grant(reader: Gid, writer: Gid) -> Granted {
     Granted { reader, writer, generation: 7, first: 3, session, ring, segments, after, relayed }
 }
 
-/// What the reader's session is told of grants, with what descriptors, and whether it hears that the pair is over.
+/// Returns the grants that the reader's session is sent, with their descriptors. Checks that no pair ends before its
+/// grant.
 fn handed(registry: &mut Registry<&'static str>) -> Vec<(Granted, Vec<&'static str>)> {
     let packets: Vec<_> = std::iter::from_fn(|| registry.poll_output(&id(READER))).collect();
     let mut handed = Vec::new();
@@ -159,7 +160,7 @@ fn handed(registry: &mut Registry<&'static str>) -> Vec<(Granted, Vec<&'static s
     handed
 }
 
-/// The publisher has come from an earlier daemon, which did not pass its grant on.
+/// Returns a registry whose publisher has come from an earlier daemon, which did not pass its grant on.
 fn with_earlier_grants(sessions: &[u8]) -> Registry<&'static str> {
     let mut registry = registry(sessions);
     let segment = Segment { number: 1, publisher: None };
@@ -270,13 +271,13 @@ fn memory_is_handed_to_the_session_of_the_reader_alone() {
                 claim(&mut registry);
             }
             assert_eq!(handed(&mut registry), [], "claimed before: {claimed_before}");
-            // The reader itself gets it, once it comes.
+            // The reader itself gets it, once it connects.
             registry.handle_disconnect(&id(READER));
             connect(&mut registry, READER);
             assert_eq!(handed(&mut registry).len(), 1, "claimed before: {claimed_before}");
         }
     }
-    // Nor is memory of another user handed on.
+    // Memory of another user is not passed on either.
     let mut registry = with_earlier_grants(&[WRITER]);
     registry.set_user(&id(WRITER), 1001);
     registry.handle_disconnect(&id(WRITER));
@@ -284,7 +285,7 @@ fn memory_is_handed_to_the_session_of_the_reader_alone() {
     assert_eq!(handed(&mut registry), []);
 }
 
-/// Another process says or grants this, many times over.
+/// Sends this UNMET or grant many times from another process.
 fn others_say(
     registry: &mut Registry<&'static str>,
     times: usize,
@@ -347,7 +348,7 @@ fn session_that_comes_back_on_another_connection_hands_no_ring_to_its_readers() 
     let mut registry = with_earlier_grants(&[WRITER, READER]);
     connect(&mut registry, WRITER);
     assert_eq!(handed(&mut registry), [], "its process lives");
-    // It says anew what it granted.
+    // The publisher reports its grant again.
     announce(&mut registry);
     say(&mut registry, SessionMessage::Grant(grant(unmet(0).reader, unmet(0).writer)));
     registry.handle_disconnect(&id(WRITER));

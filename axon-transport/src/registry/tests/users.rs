@@ -1,4 +1,4 @@
-//! What other users of the host may do: two sessions of the daemon's user, two of others.
+//! The rights of other users of the host: two sessions of the daemon's user, two of others.
 
 use std::collections::BTreeSet;
 
@@ -16,9 +16,9 @@ use EndpointKind::{Node, Publisher, Subscription};
 
 type Label = &'static str;
 
-/// Sessions of the daemon's own user.
+/// The sessions of the daemon's own user.
 const OWN: [u8; 2] = [1, 2];
-/// Sessions of other users.
+/// The sessions of other users.
 const USER: [(u8, u32); 2] = [(3, 1001), (4, 1002)];
 const GATEWAY: u8 = 100;
 
@@ -76,7 +76,7 @@ impl World {
         self.0.pairs.keys().copied().collect()
     }
 
-    /// The GIDs that a session is shown once it was told everything.
+    /// Returns the GIDs that a session sees after it was sent the complete state.
     fn seen(&mut self, session: u8) -> BTreeSet<Gid> {
         self.0.flush();
         self.0.sessions.request_resync(&id(session));
@@ -114,14 +114,14 @@ fn another_user_has_the_pairs_that_rules_allow_it_and_the_own_user_all() {
     assert!(has(out_w[0], out_r[1]) && has(out_w[2], out_r[1]));
     assert!(!has(out_w[1], out_r[0]) && !has(out_w[1], out_r[2]), "3 may not publish /out");
     assert!(has(out_w[0], out_r[0]) && has(in_w[2], in_r[0]) && has(in_w[0], in_r[2]));
-    // What is denied is in nobody's graph, the gateway's included.
+    // Denied endpoints are in no graph, including the gateway's.
     let denied = [in_r[1], out_w[1]];
     for session in [1, 4, GATEWAY] {
         let seen = world.seen(session);
         assert!(denied.iter().all(|gid| !seen.contains(gid)), "{session}");
         assert!(seen.contains(&in_w[1]) && seen.contains(&out_r[1]), "{session}");
     }
-    // It sees what it needs.
+    // The session sees what it needs.
     let seen = world.seen(3);
     assert!(seen.contains(&in_r[0]) && seen.contains(&out_w[0]));
     assert!(!seen.contains(&in_w[0]) && !seen.contains(&out_r[0]), "{seen:?}");
@@ -139,7 +139,7 @@ fn the_refusals_name_a_denied_endpoint_and_its_rule_and_its_session_keeps_it() {
     assert!(refused.text.contains("denied by line 7 of access.toml"), "{}", refused.text);
     let said = world.0.take_refused();
     assert!(said.len() == 1 && said[0].1.contains("denied by line 7 of access.toml"), "{said:?}");
-    // The same rules once more say nothing new; other ones do.
+    // The same rules once more cause no message; other rules do.
     world.set(&format!("{RULES}\n[[deny]]\npeer = \"local\"\npublish = \"/in\""));
     assert!(world.0.take_refused().is_empty());
     assert!(!world.drain(3).iter().any(|m| matches!(m, SessionMessage::Refused(_))));

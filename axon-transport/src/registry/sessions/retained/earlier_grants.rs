@@ -1,19 +1,20 @@
-//! Grants that stand until their readers come.
+//! Grants that are kept until their readers come back.
 
 use std::collections::VecDeque;
 
 use super::super::shares::makes_room;
 use crate::{ids::SessionId, registry::limits::MAX_EARLIER_GRANTS, wire::session::Granted};
 
-/// What publishers granted, by way of an earlier daemon, to readers that had not taken it up when the publishers came here.
-/// A publisher whose process is killed tells nobody what these readers lost: they are handed the grant, and the ring.
+/// Grants that publishers made through an earlier daemon, to readers that had not taken them up when the publishers
+/// connected to this one. A publisher whose process is killed reports no losses. These readers then get the grant and
+/// the ring.
 #[derive(Debug, Default)]
 pub(super) struct EarlierGrants(VecDeque<EarlierGrant>);
 
 #[derive(Debug)]
 struct EarlierGrant {
     granted: Granted,
-    /// The publisher's process.
+    /// The id of the publisher's process.
     process: u32,
 }
 
@@ -39,7 +40,7 @@ impl EarlierGrants {
         self.0.retain(|earlier_grant| !which(&earlier_grant.granted));
     }
 
-    /// Takes those of a session's publishers.
+    /// Takes the grants of a session's publishers.
     pub(super) fn take(&mut self, session: &SessionId) -> Vec<Granted> {
         let (taken, rest): (Vec<_>, _) =
             self.0.drain(..).partition(|earlier_grant| earlier_grant.granted.writer.is_of(session));

@@ -1,8 +1,8 @@
-//! Memory of sessions that ended soon after this daemon's start, while readers of theirs may not have come back yet.
+//! Memory of sessions that ended soon after this daemon's start, when their readers may not have come back yet.
 //!
-//! When a daemon is killed, a session may open a segment that no daemon passes on. The session tells the next daemon,
-//! and may end before its readers have come back and met it there. A new daemon keeps such a session's segments for a
-//! while, and hands them to readers that ask.
+//! When a daemon is killed, a session may open a segment that no daemon passes on. The session reports it to the next
+//! daemon, and may end before its readers have come back and met it there. A new daemon keeps such a session's segments
+//! for a while, and sends them to readers that ask.
 
 use std::collections::VecDeque;
 
@@ -12,7 +12,7 @@ use crate::ids::SessionId;
 /// The segments of sessions that ended.
 #[derive(Debug)]
 pub(super) struct RetainedMemory<F> {
-    /// How many segments are kept at most, as many descriptors of the daemon's.
+    /// Most segments that are kept. The daemon holds a descriptor for each.
     most: usize,
     /// In the order in which the sessions ended.
     sessions: VecDeque<(SessionId, OwnMemory<F>)>,
@@ -25,7 +25,7 @@ impl<F> Default for RetainedMemory<F> {
 }
 
 impl<F> RetainedMemory<F> {
-    /// Keeps `most` segments.
+    /// Creates memory that keeps up to `most` segments.
     pub(super) fn new(most: usize) -> Self {
         Self { most, sessions: VecDeque::new() }
     }
@@ -34,7 +34,7 @@ impl<F> RetainedMemory<F> {
         self.most > 0
     }
 
-    /// A session ended.
+    /// Keeps the segments of a session that ended.
     pub(super) fn keep(&mut self, id: SessionId, segments: OwnMemory<F>) {
         if segments.is_empty() || segments.len() > self.most {
             return;
@@ -46,7 +46,7 @@ impl<F> RetainedMemory<F> {
         }
     }
 
-    /// A session has come back.
+    /// Drops the segments of a session that has come back.
     pub(super) fn forget(&mut self, id: &SessionId) {
         self.sessions.retain(|(left, _)| left != id);
     }
@@ -80,7 +80,7 @@ mod tests {
         SessionId([number; 16])
     }
 
-    /// Two sessions whose daemon was killed, and which have come to this one.
+    /// Returns a registry with two sessions whose daemon was killed and that have connected to this one.
     fn registry() -> Registry<&'static str> {
         let mut registry = Registry::default();
         registry.keep_left_memory(MOST);
@@ -108,7 +108,7 @@ mod tests {
         registry.handle_message(&id(READER), need, vec![]).unwrap();
     }
 
-    /// The segments that the reader was handed.
+    /// Returns the segments that the reader was sent.
     fn taken(registry: &mut Registry<&'static str>) -> Vec<u32> {
         let packets = std::iter::from_fn(|| registry.poll_output(&id(READER)));
         let segments =

@@ -1,5 +1,5 @@
-//! What is kept for readers whose sessions are not here, or do not read yet: memory, grants and their rings, and the
-//! numbers of samples that they lost.
+//! What is kept for readers whose sessions are not connected, or do not read yet: memory, grants with their rings, and
+//! the numbers of samples that the readers lost.
 
 mod earlier_grants;
 mod memory;
@@ -18,12 +18,12 @@ use crate::{
     wire::session::{Granted, MAX_DESCRIPTORS, Pair, SessionMessage, Unmatch},
 };
 
-/// What sessions left to readers.
+/// What sessions left for readers.
 #[derive(Debug)]
 pub(super) struct RetainedState<F> {
-    /// Memory of those that ended.
+    /// The memory of sessions that ended.
     memory: RetainedMemory<F>,
-    /// What is for readers whose sessions are not here.
+    /// Packets for readers whose sessions are not connected.
     undelivered: UndeliveredPackets<F>,
     earlier_grants: EarlierGrants,
 }
@@ -39,28 +39,28 @@ impl<F> Default for RetainedState<F> {
 }
 
 impl<F> RetainedState<F> {
-    /// From now on keeps segments of sessions that end, `most` at a time.
+    /// Keeps up to `most` segments of sessions that end from now on.
     pub(super) fn keep_memory(&mut self, most: usize) {
         self.memory = RetainedMemory::new(most);
     }
 
-    /// Whether segments of sessions that end are kept.
+    /// Returns whether segments of sessions that end are kept.
     pub(super) fn keeps_memory(&self) -> bool {
         self.memory.is_kept()
     }
 
-    /// A segment of a session that ended.
+    /// Returns a segment of a session that ended.
     pub(super) fn segment(&self, of: &SessionId, number: u32) -> Option<&RegisteredSegment<F>> {
         self.memory.segment(of, number)
     }
 
-    /// A session came, or came back. It says anew what it granted: its process lives.
+    /// Handles a session that came or came back. Its process lives, so the session reports its grants again.
     pub(super) fn session_came(&mut self, id: &SessionId) {
         self.memory.forget(id);
         self.undelivered.take_awaiting(id);
     }
 
-    /// A session ended, which had this memory, and for whose readers these packets were kept.
+    /// Handles the end of a session: keeps its memory, and the packets that were kept for its readers.
     pub(super) fn session_ended(
         &mut self,
         id: SessionId,
@@ -68,7 +68,7 @@ impl<F> RetainedState<F> {
         kept: impl Iterator<Item = SessionPacket<F>>,
     ) {
         self.memory.keep(id, segments);
-        // It may come back.
+        // The session may come back.
         kept.for_each(|output| self.keep(output));
     }
 
@@ -77,54 +77,54 @@ impl<F> RetainedState<F> {
         self.undelivered.keep(output, None);
     }
 
-    /// Keeps a packet for its reader, until the process of session `id` has ended.
+    /// Keeps a packet for its reader, which gets it only after the process of session `id` has ended.
     pub(super) fn hold_back(&mut self, output: SessionPacket<F>, id: SessionId) {
         self.undelivered.keep(output, Some(id));
     }
 
-    /// Takes what was kept for a session's readers.
+    /// Takes the packets that were kept for a session's readers.
     pub(super) fn take_for(&mut self, id: &SessionId) -> Vec<SessionPacket<F>> {
         self.undelivered.take(id)
     }
 
-    /// Whether something awaits the end of a session's process.
+    /// Returns whether packets wait for the end of a session's process.
     pub(super) fn awaits_process(&self, id: &SessionId) -> bool {
         self.undelivered.awaits(id)
     }
 
-    /// Takes what awaited the end of a session's process.
+    /// Takes the packets that waited for the end of a session's process.
     pub(super) fn take_awaiting(&mut self, id: &SessionId) -> Vec<SessionPacket<F>> {
         self.undelivered.take_awaiting(id)
     }
 
-    /// A publisher of a process granted this by way of an earlier daemon.
+    /// Adds a grant that a publisher of `process` made through an earlier daemon.
     pub(super) fn add_earlier_grant(&mut self, granted: Granted, process: u32) {
         self.earlier_grants.note(granted, process);
     }
 
-    /// A reader is granted something else, or was told that it gets nothing.
+    /// Removes the earlier grant of a reader that got another one, or was told that it gets nothing.
     pub(super) fn forget_earlier_grant(&mut self, pair: &Pair) {
         self.earlier_grants.forget(|of| (of.reader, of.writer) == (pair.reader, pair.writer));
     }
 
-    /// A publisher has ended, and said what its readers lost.
+    /// Removes the earlier grants of a publisher that has ended and reported its readers' losses.
     pub(super) fn forget_earlier_grants(&mut self, writer: &Gid) {
         self.earlier_grants.forget(|granted| granted.writer == *writer);
     }
 
-    /// Takes the grants of a session's publishers by way of an earlier daemon.
+    /// Takes the grants that a session's publishers made through an earlier daemon.
     pub(super) fn take_earlier_grants(&mut self, id: &SessionId) -> Vec<Granted> {
         self.earlier_grants.take(id)
     }
 }
 
-/// The packets that hand a reader what a session that ends granted to it, and the ring. The reader finds there what there
-/// was for it: all of what is in the session's own segments, and the number of what is not.
+/// Returns the packets that pass the grant of a session that ends to its reader, with the ring. Through them the reader
+/// gets the samples in the session's own segments, and counts the others.
 pub(super) fn packets_of_grant<F: Clone>(
     entry: &SessionEntry<F>,
     granted: Granted,
 ) -> Vec<SessionPacket<F>> {
-    // What another user may give to readers here, the access rules say, and these may have changed.
+    // Access rules decide what another user may give to readers here, and they may have changed.
     let Some(descriptors) = entry.descriptors.clone().filter(|_| entry.user.is_none()) else {
         return Vec::new();
     };

@@ -1,4 +1,4 @@
-//! Packets for readers that are not here.
+//! Packets for readers that are not connected.
 
 use std::collections::VecDeque;
 
@@ -8,8 +8,9 @@ use crate::{
     registry::limits::{MAX_LEFT, MAX_UNMET},
 };
 
-/// Packets for readers that are not here, and that never learned of the grant of a publisher that ended. Their processes
-/// may be stopped, and may have ended. Packets that hand a ring over wait until the publisher's process has ended, too.
+/// Packets for readers that are not connected, and that never learned of the grant of a publisher that ended. The
+/// readers' processes may be stopped or have ended. Packets that pass a ring on wait until the publisher's process has
+/// ended, too.
 #[derive(Debug)]
 pub(super) struct UndeliveredPackets<F> {
     kept: VecDeque<KeptPacket<F>>,
@@ -36,8 +37,8 @@ impl<F> Default for UndeliveredPackets<F> {
 }
 
 impl<F> UndeliveredPackets<F> {
-    /// Keeps a packet for its reader, which does not get it before the process of session `awaits` has ended. A session
-    /// may say the same again.
+    /// Keeps a packet for its reader, which gets it only after the process of session `awaits` has ended. Replaces an
+    /// equal packet.
     pub(super) fn keep(&mut self, output: SessionPacket<F>, awaits: Option<SessionId>) {
         self.kept.retain(|kept| kept.output.packet != output.packet);
         let new = KeptPacket { output, awaits };
@@ -49,7 +50,7 @@ impl<F> UndeliveredPackets<F> {
         self.kept.push_back(new);
     }
 
-    /// Drops the oldest of those, of the process that has most of them.
+    /// Removes the oldest packet for which `of` holds, of the process that has the most of them.
     fn make_room(&mut self, newcomer: u32, of: impl Fn(&KeptPacket<F>) -> bool) {
         let those: Vec<usize> =
             (0..self.kept.len()).filter(|index| of(&self.kept[*index])).collect();
@@ -65,7 +66,7 @@ impl<F> UndeliveredPackets<F> {
         }
     }
 
-    /// Takes those for a session's readers.
+    /// Takes the packets for a session's readers that wait for no process.
     pub(super) fn take(&mut self, session: &SessionId) -> Vec<SessionPacket<F>> {
         self.take_where(|KeptPacket { output, awaits }| {
             awaits.is_none() && output.kept_for.is_some_and(|gid| gid.is_of(session))
@@ -77,7 +78,7 @@ impl<F> UndeliveredPackets<F> {
         self.take_where(|kept| kept.awaits.as_ref() == Some(session))
     }
 
-    /// Whether packets wait until the process of `session` has ended.
+    /// Returns whether packets wait for the end of the process of `session`.
     pub(super) fn awaits(&self, session: &SessionId) -> bool {
         self.kept.iter().any(|kept| kept.awaits.as_ref() == Some(session))
     }
