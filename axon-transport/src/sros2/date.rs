@@ -1,10 +1,10 @@
-//! The dates between which a grant is valid.
+//! The dates and times of a grant's validity.
 
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use toml::value::{Datetime, Offset};
 
-/// Seconds since 1970 of a date and time as XML Schema writes it. Without a time zone it is UTC (DDS Security 1.1,
+/// Parses a date and time of XML Schema to seconds since 1970. Without a time zone it is UTC (DDS Security 1.1,
 /// 9.4.1.3.2.2).
 pub(super) fn seconds(text: &str) -> Option<i64> {
     let Datetime { date: Some(date), time: Some(time), offset } = text.parse().ok()? else {
@@ -20,16 +20,16 @@ pub(super) fn seconds(text: &str) -> Option<i64> {
     Some(days * 86_400 + of_day + second - minutes * 60)
 }
 
-/// Days from 1970-01-01 to a day of the Gregorian calendar.
+/// Returns the days from 1970-01-01 to a day of the Gregorian calendar.
 const fn days(year: i64, month: i64, day: i64) -> i64 {
-    // The year begins with March, so that its last day is the one that may be missing.
+    // The year begins with March here, so that a leap day is its last day.
     let (year, month) = if month > 2 { (year, month - 3) } else { (year - 1, month + 9) };
     let leap_days = year.div_euclid(4) - year.div_euclid(100) + year.div_euclid(400);
     let of_year = (153 * month + 2) / 5 + day - 1;
     year * 365 + leap_days + of_year - 719_468
 }
 
-/// Seconds since 1970 of a clock's time.
+/// Converts a time to seconds since 1970.
 pub(super) fn of_clock(now: SystemTime) -> i64 {
     let whole = |seconds: u64| i64::try_from(seconds).unwrap_or(i64::MAX);
     match now.duration_since(UNIX_EPOCH) {

@@ -1,4 +1,4 @@
-//! Permissions of DDS Security, as `permissions.xml` has them: all that they say, in their order.
+//! The content of a DDS Security permissions file (`permissions.xml`), complete and in its order.
 
 use roxmltree::Node;
 
@@ -8,81 +8,81 @@ use super::{
     xml::{self, Lines, child, elements, text},
 };
 
-/// As many expressions as one grant may have.
+/// Most expressions of one grant.
 pub const MOST_EXPRESSIONS: usize = 8192;
 
-/// What one subject may do.
+/// The permissions of one subject.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SubjectGrant {
-    /// Its attribute `name`.
+    /// The attribute `name`.
     pub name: Option<String>,
-    /// The line of its start.
+    /// The line at which it starts.
     pub line: u32,
-    /// The subject of the certificate that it is for, and the line that says so.
+    /// The certificate's subject to which it applies, and the line of that element.
     pub subject: Option<(String, u32)>,
-    /// When it counts.
+    /// The period in which it is valid.
     pub validity: Option<Validity>,
     /// Its rules.
     pub rules: Vec<SubjectRule>,
-    /// Whether it allows what no rule fits, and the line that says so.
+    /// True if its default is to allow, and the line of that element.
     pub default: Option<(bool, u32)>,
-    /// Elements that are known to nobody here.
+    /// Unknown elements.
     pub unknown: Vec<UnknownElement>,
 }
 
-/// When a grant counts, as it is written.
+/// The period in which a grant is valid, as text.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Validity {
     /// The first moment.
     pub not_before: String,
-    /// The last one.
+    /// The last moment.
     pub not_after: String,
-    /// The line that says so.
+    /// The line of the element.
     pub line: u32,
 }
 
 /// An `allow_rule` or `deny_rule`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SubjectRule {
-    /// Whether it allows.
+    /// True for an `allow_rule`.
     pub allows: bool,
-    /// The line of its start.
+    /// The line at which it starts.
     pub line: u32,
-    /// The domains that it is for, of each element that names some.
+    /// The domains to which it applies, for each `domains` element.
     pub domains: Vec<Domains>,
-    /// What it is about.
+    /// The operations and topics that it allows or denies.
     pub criteria: Vec<Criteria>,
-    /// The lines of what it says of relays.
+    /// The lines of its `relay` elements.
     pub relays: Vec<u32>,
-    /// Elements that are known to nobody here.
+    /// Unknown elements.
     pub unknown: Vec<UnknownElement>,
 }
 
-/// Domains that a rule is for.
+/// The domains to which a rule applies.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Domains {
-    /// The first and the last of each range, as they are written.
+    /// The first and the last domain of each range, as text.
     pub ranges: Vec<(Option<String>, Option<String>)>,
-    /// The line that says so.
+    /// The line of the element.
     pub line: u32,
 }
 
 /// A `publish` or `subscribe`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Criteria {
-    /// What is done.
+    /// The operation.
     pub does: TopicUse,
-    /// The line of its start.
+    /// The line at which it starts.
     pub line: u32,
-    /// Expressions for topics of DDS.
+    /// The expressions for DDS topics.
     pub topics: Vec<ExpressionEntry>,
-    /// Expressions for partitions, where it has an element for some.
+    /// The expressions for partitions; `None` without a `partitions` element.
     pub partitions: Option<Vec<String>>,
-    /// Whether it has an element for data tags.
+    /// True if it has a `data_tags` element.
     pub has_data_tags: bool,
 }
 
-/// One expression.
+/// An expression with its line.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ExpressionEntry {
     /// The expression.
@@ -91,7 +91,7 @@ pub struct ExpressionEntry {
     pub line: u32,
 }
 
-/// An element that is known to nobody here.
+/// An unknown element.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct UnknownElement {
     /// Its name.
@@ -109,7 +109,7 @@ impl UnknownElement {
 /// Reads all grants of a file, which may be signed.
 ///
 /// # Errors
-/// It has no such document, or a value that is none of those that there are; the error says which, and where.
+/// The file contains no such document, or an invalid value. The error says which, and in which line.
 pub fn parse(file: &str) -> Result<Vec<SubjectGrant>, String> {
     let signed::Cleartext { text, lines_before } = signed::cleartext(file)?;
     let document = xml::parse(text)?;
@@ -123,7 +123,7 @@ pub fn parse(file: &str) -> Result<Vec<SubjectGrant>, String> {
 /// Reads all grants from the element `dds`.
 ///
 /// # Errors
-/// As [`parse`].
+/// The errors of [`parse`].
 pub fn grants(root: Node<'_, '_>, lines: &Lines) -> Result<Vec<SubjectGrant>, String> {
     let permissions = elements(root).filter(|node| node.has_tag_name("permissions"));
     let grants = permissions.flat_map(elements).filter(|node| node.has_tag_name("grant"));
@@ -171,7 +171,7 @@ fn grant(node: Node<'_, '_>, lines: &Lines) -> Result<SubjectGrant, String> {
     Ok(read)
 }
 
-/// Sets what a grant may say once.
+/// Sets a value that a grant may contain only once.
 fn once<T>(
     place: &mut Option<T>,
     value: T,
@@ -187,10 +187,10 @@ fn once<T>(
     }
 }
 
-/// The value of an element or attribute that says ALLOW or DENY.
+/// Parses the value of an element or attribute: true for ALLOW, false for DENY.
 ///
 /// # Errors
-/// It says neither.
+/// It is neither of them.
 pub fn allows(value: &str, line: u32) -> Result<bool, String> {
     match value {
         "ALLOW" => Ok(true),
@@ -257,7 +257,7 @@ fn criteria(
     read
 }
 
-/// The texts of the elements of a name.
+/// Returns the texts of the elements with this name, and collects unknown elements.
 fn list(
     node: Node<'_, '_>,
     name: &str,
@@ -291,7 +291,7 @@ fn domains(node: Node<'_, '_>, lines: &Lines, unknown: &mut Vec<UnknownElement>)
     Domains { ranges, line: lines.of(node) }
 }
 
-/// The common name of a certificate's subject: `/arm` of `CN=/arm,O=x`.
+/// Returns the common name of a certificate's subject: `/arm` of `CN=/arm,O=x`.
 pub fn common_name(subject: &str) -> Option<&str> {
     subject.split(',').find_map(|part| part.trim().strip_prefix("CN="))
 }

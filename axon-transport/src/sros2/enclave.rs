@@ -1,4 +1,4 @@
-//! The permissions of the enclave that a session is in.
+//! The permissions of the enclave of a session.
 
 use std::{
     path::{Path, PathBuf},
@@ -15,13 +15,13 @@ use super::{
 };
 use crate::graph::EndpointKind;
 
-/// What a process of one enclave may publish, subscribe to, serve and call, as `permissions.p7s` or `permissions.xml`
-/// of that enclave says it.
+/// The topics and services that a process of one enclave may publish, subscribe to, serve and call, according to the
+/// `permissions.p7s` or `permissions.xml` of that enclave.
 ///
 /// A session that [has them](crate::SessionOptions::permissions) refuses to create any other endpoint. They keep a
-/// well-behaved process within its enclave. A process that means harm could do without them: what protects other hosts
-/// from it are the [rules](crate::access::AccessRules) there. The signature of the file is not verified for the same
-/// reason: the CA's certificate, by which it would be, lies in the same folder as the file.
+/// well-behaved process within its enclave. A malicious process could do without them; the
+/// [rules](crate::access::AccessRules) of other hosts protect those hosts from it. For the same reason the signature of
+/// the file is not verified: the CA's certificate that would verify it lies in the same folder as the file.
 ///
 /// ```
 /// use std::time::SystemTime;
@@ -43,25 +43,25 @@ use crate::graph::EndpointKind;
 pub struct EnclavePermissions {
     enclave: String,
     path: PathBuf,
-    /// Those for the enclave, in their order. There is one at least.
+    /// The grants for the enclave, in their order. There is at least one.
     grants: Vec<CompiledGrant>,
 }
 
 impl EnclavePermissions {
-    /// Reads the file of an enclave, such as `/robot/arm`.
+    /// Reads the file of an enclave such as `/robot/arm`.
     ///
     /// # Errors
-    /// The file cannot be read, everybody may write it, it has more than 1 MiB, has no grant for the enclave, or has one
-    /// of which anything is not understood.
+    /// The file cannot be read, everybody may write it, it is larger than 1 MiB, it has no grant for the enclave, or a
+    /// grant for the enclave is not completely understood.
     pub fn read(path: impl AsRef<Path>, enclave: &str) -> Result<Self, PermissionsError> {
         let path = path.as_ref();
         Self::parse(&file::read(path)?, path, enclave)
     }
 
-    /// As [`read`](Self::read), of a text. `path` is what errors call it.
+    /// Like [`read`](Self::read), for a text. Errors name `path` as its file.
     ///
     /// # Errors
-    /// As there.
+    /// The errors of [`read`](Self::read) about the content.
     pub fn parse(
         text: &str,
         path: impl Into<PathBuf>,
@@ -93,20 +93,20 @@ impl EnclavePermissions {
         Ok(Self { enclave: enclave.to_owned(), path, grants })
     }
 
-    /// The enclave.
+    /// Returns the enclave.
     pub fn enclave(&self) -> &str {
         &self.enclave
     }
 
-    /// The file.
+    /// Returns the path of the file.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Whether a session may be opened in a domain at this time, as a participant of DDS may join one.
+    /// Checks that a session may be opened in a domain at this time, like a DDS participant that joins it.
     ///
     /// # Errors
-    /// They are not valid then, or allow nothing in that domain.
+    /// The permissions are not valid at this time, or allow nothing in that domain.
     pub fn check_domain(&self, domain: u32, now: SystemTime) -> Result<(), PermissionsError> {
         let (path, enclave) = (self.path.clone(), self.enclave.clone());
         let grant = match self.grant(now) {
@@ -130,11 +130,11 @@ impl EnclavePermissions {
         Err(PermissionsError::Domain { path, enclave, domain, allowed, line })
     }
 
-    /// Whether the enclave may have an endpoint of this kind and name in a domain at this time. A client needs both
-    /// halves, the requests and the responses, and so does a server.
+    /// Checks that the enclave may have an endpoint of this kind and name in a domain at this time. A client needs
+    /// permissions for both requests and responses, and so does a server.
     ///
     /// # Errors
-    /// The first thing that it may not do.
+    /// The first operation that the enclave is denied.
     pub fn check(
         &self,
         kind: EndpointKind,
@@ -167,7 +167,7 @@ impl EnclavePermissions {
         Denial(Box::new(Denied { enclave, path, does, topic, reason }))
     }
 
-    /// The first grant that is valid, or when the last one is.
+    /// Returns the first valid grant, or else the validity of the last one.
     fn grant(&self, now: SystemTime) -> Result<&CompiledGrant, &document::Validity> {
         let now = date::of_clock(now);
         let last = &self.grants[self.grants.len() - 1];

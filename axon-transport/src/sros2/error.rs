@@ -1,14 +1,14 @@
-//! Why permissions cannot be used, and why they do not allow something.
+//! The errors of permissions, and the denials.
 
 use std::{fmt, io, path::PathBuf};
 
 use super::names::TopicUse;
 use crate::text::plain;
 
-/// Shown of a name from a file.
+/// Maximum length shown of a name from a file.
 const SHOWN: usize = 200;
 
-/// Why an enclave's permissions cannot be used.
+/// The reason why an enclave's permissions cannot be used.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum PermissionsError {
@@ -20,15 +20,15 @@ pub enum PermissionsError {
     Unreadable {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The error of the system.
         source: io::Error,
     },
-    /// It is no such file, or says something that is not understood: nothing of it counts then.
+    /// The file is no permissions file, or contains something that is not understood. Then nothing in it is used.
     #[error("{}: {}", path.display(), plain(what, 1000))]
     Malformed {
         /// The file.
         path: PathBuf,
-        /// What is wrong, and in which line.
+        /// The defect, with its line.
         what: String,
     },
     /// It has no grant for the enclave.
@@ -47,7 +47,7 @@ pub enum PermissionsError {
         /// The subjects of its grants.
         known: String,
     },
-    /// The grant does not count yet, or any more.
+    /// The grant is not valid yet, or no longer.
     #[error(
         "{}: the permissions of enclave {} are valid from {not_before} to {not_after} UTC (line {line}); \
          `ros2 security create_permission` renews them",
@@ -59,11 +59,11 @@ pub enum PermissionsError {
         path: PathBuf,
         /// The enclave.
         enclave: String,
-        /// The first moment, as it is written.
+        /// The first moment, as it is written in the file.
         not_before: String,
-        /// The last one.
+        /// The last moment, as it is written in the file.
         not_after: String,
-        /// The line that says so.
+        /// The line of the validity.
         line: u32,
     },
     /// Nothing is allowed in the session's domain.
@@ -80,14 +80,15 @@ pub enum PermissionsError {
         enclave: String,
         /// The session's domain.
         domain: u32,
-        /// The domains in which something is allowed.
+        /// The domains in which something is allowed, for people.
         allowed: String,
         /// The line of the grant.
         line: u32,
     },
 }
 
-/// Why an enclave may not have an endpoint. Its text names the enclave, the topic of DDS, the file and the line.
+/// The reason why an enclave may not have an endpoint. Its text names the enclave, the DDS topic, the file and the
+/// line.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Denial(pub(super) Box<Denied>);
 
@@ -100,19 +101,19 @@ pub(super) struct Denied {
     pub(super) reason: DenialReason,
 }
 
-/// What denies it.
+/// The part of the permissions that denies it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum DenialReason {
-    /// The line of an expression of a `deny_rule`.
+    /// An expression of a `deny_rule`, on this line.
     Rule(u32),
-    /// No rule fits, and this line says that the default is to deny.
+    /// The default on this line; no rule fits.
     Default(u32),
-    /// The grant is not valid now, by this line.
+    /// The validity on this line: the grant is not valid now.
     NotValid { not_before: String, not_after: String, line: u32 },
 }
 
 impl Denial {
-    /// The line of the file that decides.
+    /// Returns the line of the file that decides.
     pub fn line(&self) -> u32 {
         match self.0.reason {
             DenialReason::Rule(line)

@@ -1,9 +1,9 @@
-//! Expressions for names of DDS: those of POSIX's `fnmatch` without flags, in which `*` and `?` stand for slashes, too.
+//! Expressions for DDS names: those of POSIX's `fnmatch` without flags, so `*` and `?` also match slashes.
 
 /// The longest expression, in bytes.
 const MAX_EXPRESSION_BYTES: usize = 4096;
 
-/// An expression that is known to be well-formed.
+/// A well-formed expression.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Expression(String);
 
@@ -14,7 +14,7 @@ enum ExpressionStep<'a> {
     /// `?`.
     One,
     Character(char),
-    /// What is between brackets, without the `!`.
+    /// A bracket expression, without the `!` or `^`.
     Set {
         inner: &'a str,
         inverted: bool,
@@ -22,10 +22,10 @@ enum ExpressionStep<'a> {
 }
 
 impl Expression {
-    /// An expression.
+    /// Checks an expression.
     ///
     /// # Errors
-    /// What `fnmatch` would fit no name with, or each locale another one, and what is too long.
+    /// `fnmatch` would match no name with it, or the result would depend on the locale; or it is too long.
     pub fn new(text: &str) -> Result<Self, &'static str> {
         if text.len() > MAX_EXPRESSION_BYTES {
             return Err("longer than 4,096 bytes");
@@ -44,10 +44,10 @@ impl Expression {
         Ok(Self(text.to_owned()))
     }
 
-    /// Whether it fits a name.
+    /// Returns whether the expression matches a name.
     pub fn fits(&self, name: &str) -> bool {
         let (mut pattern, mut name) = (self.0.as_str(), name);
-        // Behind the last star, and what that star has not taken.
+        // The expression behind the last star, and the rest of the name that the star has not matched.
         let mut retry: Option<(&str, &str)> = None;
         loop {
             let character = name.chars().next();
@@ -65,7 +65,7 @@ impl Expression {
                 (None, None) => return true,
                 _ => {}
             }
-            // The star takes one character more.
+            // The star matches one more character.
             let Some((behind, left)) = retry else { return false };
             let Some(c) = left.chars().next() else { return false };
             name = &left[c.len_utf8()..];
@@ -74,14 +74,14 @@ impl Expression {
         }
     }
 
-    /// Its text.
+    /// Returns the expression as text.
     pub fn as_str(&self) -> &str {
         &self.0
     }
 }
 
 impl ExpressionStep<'_> {
-    /// Whether it fits one character.
+    /// Returns whether the step matches a character.
     fn fits(&self, c: char) -> bool {
         match *self {
             Self::Many | Self::One => true,
@@ -102,7 +102,7 @@ impl ExpressionStep<'_> {
     }
 }
 
-/// The first step of a pattern, and the rest. `None` at its end, and where a backslash escapes nothing.
+/// Splits off the first step of a pattern. Returns `None` at its end, or if a backslash escapes nothing.
 fn step(pattern: &str) -> Option<(ExpressionStep<'_>, &str)> {
     let mut characters = pattern.chars();
     let step = match characters.next()? {
@@ -112,7 +112,7 @@ fn step(pattern: &str) -> Option<(ExpressionStep<'_>, &str)> {
         '[' => {
             let (inner, behind) = match set(characters.as_str()) {
                 Some(found) => found,
-                // Nothing closes it.
+                // No bracket closes it, so it is a character.
                 None => return Some((ExpressionStep::Character('['), characters.as_str())),
             };
             let positive = inner.strip_prefix(['!', '^']);
@@ -127,9 +127,9 @@ fn step(pattern: &str) -> Option<(ExpressionStep<'_>, &str)> {
     Some((step, characters.as_str()))
 }
 
-/// What is between brackets, of which the first is open, and what is behind the second.
+/// Splits `open`, the text after an opening bracket: the text up to the closing bracket, and the text behind that.
 fn set(open: &str) -> Option<(&str, &str)> {
-    // One that comes first closes nothing.
+    // A closing bracket in first place is a member of the set.
     let mut at = usize::from(open.starts_with(['!', '^']));
     at += usize::from(open[at..].starts_with(']'));
     loop {
@@ -149,13 +149,13 @@ fn set(open: &str) -> Option<(&str, &str)> {
     }
 }
 
-/// What a set has.
+/// A member of a set.
 enum Member {
     Range(char, char),
     Class(fn(&char) -> bool),
 }
 
-/// The first member of a set, and the rest.
+/// Splits off the first member of a set.
 fn member(inner: &str) -> Result<Option<(Member, &str)>, &'static str> {
     if inner.starts_with("[=") || inner.starts_with("[.") {
         return Err("has an equivalence class or a collating symbol");
@@ -182,7 +182,7 @@ fn character(text: &str) -> Option<(char, &str)> {
     Some((c, &text[c.len_utf8()..]))
 }
 
-/// As in the locale C.
+/// Returns the class of characters of this name, as in the C locale.
 fn class(name: &str) -> Option<fn(&char) -> bool> {
     Some(match name {
         "alnum" => char::is_ascii_alphanumeric,

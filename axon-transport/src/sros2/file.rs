@@ -10,14 +10,15 @@ use std::{
 use super::{PermissionsError, xml::LARGEST};
 use crate::config::elevated;
 
-/// The text of a file that nobody but its owner and its group may write.
+/// Reads a file that only its owner and its group may write.
 ///
 /// # Errors
-/// It cannot be read, is no regular file, is too large or not UTF-8, or everybody may write it.
+/// The file cannot be read, is not a regular file, is too large or not UTF-8, or everybody may
+/// write it.
 pub(super) fn read(path: &Path) -> Result<String, PermissionsError> {
     let malformed = |what: String| PermissionsError::Malformed { path: path.to_owned(), what };
     if axon_shm::internal::is_elevated() {
-        // Its caller says where the keystore is.
+        // The caller of a privileged program chooses where the keystore is.
         elevated::check_owner(path).map_err(malformed)?;
     }
     let bytes = bytes(path)
@@ -27,7 +28,7 @@ pub(super) fn read(path: &Path) -> Result<String, PermissionsError> {
 }
 
 fn bytes(path: &Path) -> io::Result<Result<Vec<u8>, &'static str>> {
-    // A pipe in its place must not hang the start.
+    // Opening a pipe in its place must not block.
     const O_NONBLOCK: i32 = rustix::fs::OFlags::NONBLOCK.bits() as i32;
     let file = OpenOptions::new().read(true).custom_flags(O_NONBLOCK).open(path)?;
     let facts = file.metadata()?;

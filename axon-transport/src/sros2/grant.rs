@@ -1,4 +1,4 @@
-//! A grant of which everything is understood, and what it decides.
+//! A grant that is completely understood, and its decisions.
 
 use super::{
     date,
@@ -7,7 +7,7 @@ use super::{
     names::TopicUse,
 };
 
-/// A grant that can be judged by.
+/// A grant that can decide.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct CompiledGrant {
     pub(super) line: u32,
@@ -22,13 +22,13 @@ pub(super) struct CompiledGrant {
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct CompiledRule {
     allows: bool,
-    /// The first and the last of each range.
+    /// The first and the last domain of each range.
     domains: Vec<(u32, u32)>,
     publish: Vec<(Expression, u32)>,
     subscribe: Vec<(Expression, u32)>,
 }
 
-/// What a grant decides, and the line that does.
+/// The decision of a grant; a denial has the line that decides.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum GrantDecision {
     Allowed,
@@ -37,8 +37,10 @@ pub(super) enum GrantDecision {
 }
 
 impl CompiledGrant {
+    /// Compiles a grant.
+    ///
     /// # Errors
-    /// A part of it is missing or not understood. What is not understood might be a denial.
+    /// A part of the grant is missing or not understood. Such a part might be a denial.
     pub(super) fn new(read: document::SubjectGrant) -> Result<Self, String> {
         let of_grant = |what: &str| format!("line {}: the grant has no <{what}>", read.line);
         known(&read.unknown)?;
@@ -61,17 +63,17 @@ impl CompiledGrant {
         })
     }
 
-    /// Whether it counts at a time in seconds since 1970.
+    /// Returns whether the grant is valid at a time in seconds since 1970.
     pub(super) fn is_valid(&self, now: i64) -> bool {
         (self.not_before..=self.not_after).contains(&now)
     }
 
-    /// Whether anything may be allowed in a domain.
+    /// Returns whether anything may be allowed in a domain.
     pub(super) fn counts_in(&self, domain: u32) -> bool {
         self.allows_by_default || self.rules.iter().any(|rule| rule.allows && rule.is_for(domain))
     }
 
-    /// The domains in which something may be allowed, for people.
+    /// Returns the domains in which something may be allowed, for people.
     pub(super) fn domains(&self) -> String {
         let ranges = self.rules.iter().filter(|rule| rule.allows).flat_map(|rule| &rule.domains);
         let mut shown: Vec<_> = ranges
@@ -86,7 +88,7 @@ impl CompiledGrant {
         if shown.is_empty() { "none".to_owned() } else { shown.join(", ") }
     }
 
-    /// The first rule for the domain that fits decides, else the default.
+    /// Decides by the first rule for the domain that fits, or else by the default.
     pub(super) fn decide(&self, domain: u32, does: TopicUse, topic: &str) -> GrantDecision {
         let rules = self.rules.iter().filter(|rule| rule.is_for(domain));
         for rule in rules {
@@ -150,8 +152,8 @@ impl CompiledRule {
     }
 }
 
-/// Whether criteria are about the partition without a name, in which an endpoint of ROS 2 is. Where they name none,
-/// a budget is about that one and a denial about all.
+/// Returns whether criteria apply to the partition without a name, which contains the endpoints of ROS 2. Without
+/// partitions they do: an `allow_rule` then applies to that partition, and a `deny_rule` to all.
 fn has_own_partition(partitions: Option<&[String]>, line: u32) -> Result<bool, String> {
     let Some(partitions) = partitions else { return Ok(true) };
     if partitions.is_empty() {
@@ -192,8 +194,10 @@ fn domains(all: &[document::Domains], line: u32) -> Result<Vec<(u32, u32)>, Stri
     Ok(ranges)
 }
 
+/// Checks that there are no unknown elements.
+///
 /// # Errors
-/// There is an element that nobody here knows.
+/// There is an unknown element.
 fn known(unknown: &[UnknownElement]) -> Result<(), String> {
     match unknown.first() {
         None => Ok(()),

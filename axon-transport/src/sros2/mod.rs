@@ -1,8 +1,7 @@
 //! SROS2's permissions of an enclave: what a process of that enclave may publish and subscribe to.
 //!
-//! `document` is what a file says, in its order. The session judges by it, and `axon acl import` translates it.
-//! [`EnclavePermissions`] judges as
-//! DDS Security 1.1 does (9.4.1.3): the first rule that fits decides.
+//! `document` contains the content of a file in its order. The session decides by it, and `axon acl import` translates
+//! it. [`EnclavePermissions`] decides as DDS Security 1.1 does (9.4.1.3): by the first rule that fits.
 
 mod date;
 pub(crate) mod document;

@@ -1,18 +1,18 @@
-//! What ROS 2 calls its topics and services in DDS.
+//! The DDS names of ROS 2's topics and services.
 
 use crate::graph::EndpointKind;
 
-/// What a participant of DDS does with a topic of DDS.
+/// An operation of a DDS participant on a DDS topic.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum TopicUse {
-    /// It writes.
+    /// The participant writes.
     Publish,
-    /// It reads.
+    /// The participant reads.
     Subscribe,
 }
 
 impl TopicUse {
-    /// As a verb before a topic.
+    /// Returns the verb that precedes the topic in a text.
     pub const fn verb(self) -> &'static str {
         match self {
             Self::Publish => "publish",
@@ -21,22 +21,22 @@ impl TopicUse {
     }
 }
 
-/// What a topic of DDS carries.
+/// The kind of messages of a DDS topic.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum TopicPart {
     /// The samples of a topic.
     Topic,
     /// The requests of a service.
     Request,
-    /// Its responses.
+    /// The responses of a service.
     Reply,
 }
 
 impl TopicPart {
-    /// All of them.
+    /// All kinds.
     pub const ALL: [Self; 3] = [Self::Topic, Self::Request, Self::Reply];
 
-    /// What stands before the name and behind it. The name begins with a slash.
+    /// Returns the prefix and the suffix of a name. The name begins with a slash.
     pub const fn mangling(self) -> (&'static str, &'static str) {
         match self {
             Self::Topic => ("rt", ""),
@@ -45,7 +45,8 @@ impl TopicPart {
         }
     }
 
-    /// The topic of DDS. A name without a slash in front is one that avoids ROS's conventions, and gets no prefix.
+    /// Returns the name of the DDS topic. A name without a leading slash does not follow ROS's conventions and gets no
+    /// prefix.
     pub fn dds_name(self, name: &str) -> String {
         let (prefix, suffix) = self.mangling();
         let prefix = if name.starts_with('/') { prefix } else { "" };
@@ -53,7 +54,7 @@ impl TopicPart {
     }
 }
 
-/// What the participant of an endpoint does: each of these with that topic of DDS.
+/// Returns the operations of an endpoint's participant, each with its DDS topic.
 pub const fn uses(kind: EndpointKind) -> &'static [(TopicUse, TopicPart)] {
     match kind {
         EndpointKind::Publisher => &[(TopicUse::Publish, TopicPart::Topic)],

@@ -3,19 +3,19 @@
 //! The signature is not verified. The certificate of the CA by which a DDS middleware would verify it lies in the same
 //! folder as the document. A user who can replace the document can replace the certificate too.
 
-/// Where a document begins that may be signed.
+/// The start of a document that may be signed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Cleartext<'a> {
     /// The document itself.
     pub text: &'a str,
-    /// How many lines of the file are before it.
+    /// The number of lines of the file before it.
     pub lines_before: usize,
 }
 
-/// The document in a file: the first part of a signed one, or else the file as it is.
+/// Returns the document in a file: the first part of a signed file, or else the whole file.
 ///
 /// # Errors
-/// It is signed, and not in a form that is read here; the error says why.
+/// The file is signed in an unsupported form; the error says why.
 pub fn cleartext(file: &str) -> Result<Cleartext<'_>, String> {
     if !is_mime(file) {
         return Ok(Cleartext { text: file, lines_before: 0 });
@@ -46,7 +46,7 @@ pub fn cleartext(file: &str) -> Result<Cleartext<'_>, String> {
     Ok(Cleartext { text, lines_before: file[..before].matches('\n').count() })
 }
 
-/// Whether a file begins with a field of MIME, and not as XML does.
+/// Returns whether a file begins with a MIME field, and not with XML.
 fn is_mime(file: &str) -> bool {
     let first = file.trim_start_matches('\u{feff}').trim_start().split('\n').next();
     let name = first.and_then(|line| line.split_once(':')).map(|(name, _)| name);
@@ -55,7 +55,7 @@ fn is_mime(file: &str) -> bool {
     })
 }
 
-/// A header, and what is behind the empty line that ends it. A part may have no field at all.
+/// Splits a text at the empty line that ends its header. The header of a part may have no fields.
 fn split_header(text: &str) -> Option<(&str, &str)> {
     let mut at = 0;
     for line in text.split_inclusive('\n') {
@@ -67,7 +67,7 @@ fn split_header(text: &str) -> Option<(&str, &str)> {
     None
 }
 
-/// The value of a field, with the lines that continue it.
+/// Returns the value of a field, with its continuation lines.
 fn field(header: &str, name: &str) -> Option<String> {
     let mut lines = header.lines();
     let of = |line: &str| {
@@ -82,7 +82,7 @@ fn field(header: &str, name: &str) -> Option<String> {
     Some(value)
 }
 
-/// A parameter of a Content-Type, without its quotation marks.
+/// Returns a parameter of a Content-Type, without its quotation marks.
 fn parameter(parameters: &str, name: &str) -> Option<String> {
     let mut rest = parameters;
     loop {
@@ -99,7 +99,7 @@ fn parameter(parameters: &str, name: &str) -> Option<String> {
     }
 }
 
-/// What is between the first two lines that delimit parts, and what is behind the second.
+/// Returns the text between the first two delimiter lines, and the text from the second on.
 fn between<'a>(body: &'a str, boundary: &str) -> Option<(&'a str, &'a str)> {
     let mut begin = None;
     let mut at = 0;
@@ -108,7 +108,7 @@ fn between<'a>(body: &'a str, boundary: &str) -> Option<(&'a str, &'a str)> {
         let delimits = ends.strip_prefix("--").and_then(|rest| rest.strip_prefix(boundary));
         match (begin, delimits) {
             (None, Some("")) => begin = Some(at + line.len()),
-            // The last one ends so.
+            // The last delimiter ends with two hyphens.
             (Some(begin), Some("" | "--")) => return Some((&body[begin..at], &body[at..])),
             _ => {}
         }
@@ -136,7 +136,7 @@ mod tests {
         assert_eq!(cleartext(&all_cr).unwrap().text, "<dds>\r\n</dds>\r\n\r\n");
         let folded = SIGNED.replace("; boundary=\"----3D\"", ";\n\tboundary=----3D ; x=y");
         assert_eq!(cleartext(&folded).unwrap().text, found.text);
-        // As `ros2 security` writes it: Python's boundary has the character that ends a parameter's name.
+        // The form that `ros2 security` writes: Python's boundary contains the character that ends a parameter's name.
         let python =
             SIGNED.replace("----3D", "====12==").replace("\r\n", "\n").replace('\n', "\r\n");
         assert_eq!(cleartext(&python).unwrap().text, "<dds>\r\n</dds>\r\n\r\n");

@@ -1,4 +1,4 @@
-//! Grants against a model, and documents that want to do harm.
+//! Tests grants against a model, and hostile documents.
 
 use std::{
     os::unix::fs::{PermissionsExt, symlink},
@@ -10,7 +10,7 @@ use proptest::prelude::*;
 use super::{EnclavePermissions, PermissionsError, names::TopicUse};
 use crate::graph::EndpointKind;
 
-/// 2026-06-01.
+/// Returns 2026-06-01.
 fn now() -> SystemTime {
     UNIX_EPOCH + Duration::from_secs(1_780_272_000)
 }
@@ -18,7 +18,7 @@ fn now() -> SystemTime {
 const VALID: &str = "<validity><not_before>2026-01-01T00:00:00</not_before>\
                      <not_after>2027-01-01T00:00:00</not_after></validity>";
 
-/// A file with these parts of a grant for `/arm`, a line each.
+/// Returns a file with these parts of a grant for `/arm`, one line each.
 fn file(parts: &str) -> String {
     format!(
         "<dds xmlns:xsi=\"http://www.w3.org/2001/XMLSchema-instance\"><permissions>\n<grant name=\"/arm\">\n\
@@ -148,7 +148,7 @@ fn a_rule_counts_in_its_domains_alone() {
     ] {
         assert!(refused(&of(wrong)).contains(why), "{wrong}");
     }
-    // Only denials there: the default is what a participant may do.
+    // The rule only denies; the default decides whether the participant may be in the domain.
     let deny = rule("deny", "publish", &["rt/a"]);
     parse(&grant(&deny, "ALLOW")).unwrap().check_domain(7, now()).unwrap();
     parse(&grant(&deny, "DENY")).unwrap().check_domain(0, now()).unwrap_err();
@@ -231,7 +231,7 @@ fn of_several_grants_the_first_that_is_valid_counts() {
     }
     let said = EnclavePermissions::parse(&text, "p", "/tail").unwrap_err().to_string();
     assert!(said.contains("CN=/tail, but CN=/leg; CN=/arm; O=robots, CN=/arm"), "{said}");
-    // The name of a grant is no identity.
+    // The name of a grant does not identify an enclave.
     EnclavePermissions::parse(&text, "p", "x").unwrap_err();
 }
 
@@ -262,7 +262,7 @@ fn permissions_with_unknown_or_invalid_elements_are_refused() {
         let text = if text.starts_with("<allow") { grant(&text, "DENY") } else { text };
         assert!(refused(&text).contains(why), "{why}: {}", refused(&text));
     }
-    // Known, and nothing that AXON does.
+    // A known element for something that AXON does not do.
     parse(&with("<relay><topics><topic>*</topic></topics></relay>")).unwrap();
 }
 
@@ -321,7 +321,7 @@ fn world_writable_missing_or_irregular_permissions_files_are_refused() {
     assert!(read().unwrap_err().contains("not UTF-8"));
     std::fs::write(&path, format!("{text}{}", " ".repeat(1 << 20))).unwrap();
     assert!(read().unwrap_err().contains("larger than 1 MiB"));
-    // A pipe that nobody writes, and what is endless.
+    // A pipe that no process writes to, and an endless file.
     std::fs::remove_file(&path).unwrap();
     rustix::fs::mkfifoat(rustix::fs::CWD, &path, rustix::fs::Mode::RUSR).unwrap();
     assert!(read().unwrap_err().contains("not a regular file"));
@@ -333,7 +333,7 @@ fn world_writable_missing_or_irregular_permissions_files_are_refused() {
     assert!(read().unwrap_err().contains("not a regular file"));
 }
 
-/// What a rule is, for the model.
+/// A rule of the model.
 #[derive(Clone, Debug)]
 struct Drawn {
     allows: bool,
@@ -361,7 +361,7 @@ impl Drawn {
     }
 }
 
-/// As in POSIX, by the definition: a star stands for nothing, or for one character and a star.
+/// Implements POSIX's definition: a star matches nothing, or one character and then a star again.
 fn fnmatch(pattern: &[u8], name: &[u8]) -> bool {
     match (pattern.first(), name.first()) {
         (None, None) => true,

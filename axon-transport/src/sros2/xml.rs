@@ -6,9 +6,9 @@ use roxmltree::{Document, Node, ParsingOptions};
 pub const LARGEST: u64 = 1 << 20;
 /// The deepest element. Policies have eight levels.
 const DEEPEST: usize = 16;
-/// The longest start tag, in bytes: attributes are compared with each other.
+/// The longest start tag, in bytes. Attributes are compared with each other, which takes quadratic time.
 const LONGEST_TAG: usize = 8192;
-/// As many declarations of namespaces: each element keeps those around it.
+/// The most declarations of namespaces, because each element keeps the declarations around it.
 const MOST_NAMESPACES: usize = 16;
 
 /// Parses a document.
@@ -35,7 +35,7 @@ pub fn parse(text: &str) -> Result<Document<'_>, String> {
     Ok(document)
 }
 
-/// The lines of a document.
+/// The line numbers of a document.
 #[derive(Debug)]
 pub struct Lines {
     ends: Vec<usize>,
@@ -43,29 +43,29 @@ pub struct Lines {
 }
 
 impl Lines {
-    /// Those of a document that begins `before` lines behind the start of its file.
+    /// Creates the line numbers of a document that begins `before` lines after the start of its file.
     pub fn new(text: &str, before: usize) -> Self {
         Self { ends: text.match_indices('\n').map(|(at, _)| at).collect(), before }
     }
 
-    /// That of an element, counted from 1.
+    /// Returns the line of an element, counted from 1.
     pub fn of(&self, node: Node<'_, '_>) -> u32 {
         let ended = self.ends.partition_point(|end| *end < node.range().start);
         u32::try_from(self.before + ended + 1).unwrap_or(u32::MAX)
     }
 }
 
-/// The elements in an element.
+/// Returns the child elements of an element.
 pub fn elements<'a, 'i>(node: Node<'a, 'i>) -> impl Iterator<Item = Node<'a, 'i>> {
     node.children().filter(Node::is_element)
 }
 
-/// The first element of this name in an element.
+/// Returns the first child element with this name.
 pub fn child<'a, 'i>(node: Node<'a, 'i>, name: &str) -> Option<Node<'a, 'i>> {
     elements(node).find(|child| child.tag_name().name() == name)
 }
 
-/// The text of an element, without the blanks around it. A comment in it parts nothing.
+/// Returns the text of an element, without surrounding white space. A comment inside does not split it.
 pub fn text(node: Node<'_, '_>) -> String {
     let parts = node.children().filter(Node::is_text).filter_map(|part| part.text());
     parts.collect::<String>().trim().to_owned()
