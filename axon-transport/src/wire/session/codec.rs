@@ -4,39 +4,39 @@ use minicbor::{Decode, Encode};
 
 use super::{MAX_PACKET, SessionMessage};
 
-/// Why bytes are not a message, or a message has no bytes.
+/// The reason why bytes are not a message, or why a message cannot be encoded.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum CodecError {
-    /// Nothing at all.
+    /// The packet is empty.
     #[error("an empty packet")]
     Empty,
-    /// More than a packet holds.
+    /// The packet is larger than permitted.
     #[error("a message of {0} bytes; a packet holds {MAX_PACKET}")]
     TooLarge(usize),
-    /// Not the map that the type calls for.
+    /// The map is not the one that the type requires.
     #[error("message type {kind}: {source}")]
     Malformed {
         /// The message's type byte.
         kind: u8,
-        /// What the decoder found.
+        /// The error of the decoder.
         source: minicbor::decode::Error,
     },
-    /// Bytes after the map.
+    /// There are bytes after the map.
     #[error("message type {0}: bytes after the map")]
     Trailing(u8),
 }
 
-/// What a message without content consists of.
+/// The map of a message without content.
 #[derive(Clone, Copy, Debug, Encode, Decode)]
 #[cbor(map)]
 struct Empty {}
 
 impl SessionMessage {
-    /// The packet's bytes.
+    /// Encodes the message as a packet.
     ///
     /// # Errors
-    /// [`CodecError::TooLarge`] when they do not fit into one packet.
+    /// [`CodecError::TooLarge`] if the message does not fit in one packet.
     pub fn encode(&self) -> Result<Vec<u8>, CodecError> {
         let (kind, body) = match self {
             Self::Hello(m) => (1, minicbor::to_vec(m)),
@@ -68,7 +68,7 @@ impl SessionMessage {
             Self::AccessCheck(m) => (29, minicbor::to_vec(m)),
             Self::Unknown(kind) => (*kind, minicbor::to_vec(Empty {})),
         };
-        // Encoding into a Vec has no way to fail.
+        // Encoding into a `Vec` cannot fail.
         let body = body.unwrap_or_default();
         if body.len() + 1 > MAX_PACKET {
             return Err(CodecError::TooLarge(body.len() + 1));
@@ -79,15 +79,15 @@ impl SessionMessage {
         Ok(packet)
     }
 
-    /// Whether a packet is part of a status.
+    /// Returns whether a packet is part of a status.
     pub(crate) fn is_status(packet: &[u8]) -> bool {
         packet.first() == Some(&13)
     }
 
-    /// The message of one packet.
+    /// Decodes a packet.
     ///
     /// # Errors
-    /// When it is empty, too large, or not the map its type calls for.
+    /// The packet is empty, too large, or not the map that its type requires.
     pub fn decode(packet: &[u8]) -> Result<Self, CodecError> {
         if packet.len() > MAX_PACKET {
             return Err(CodecError::TooLarge(packet.len()));

@@ -26,7 +26,7 @@ pub const MAX_PACKET: usize = 32 * 1024;
 /// The most descriptors that one packet carries.
 pub const MAX_DESCRIPTORS: usize = 8;
 
-/// What kind of session this is.
+/// The kind of a session.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode, Serialize)]
 #[cbor(index_only)]
 #[serde(rename_all = "snake_case")]
@@ -37,17 +37,17 @@ pub enum SessionRole {
     /// The daemon's own gateway to other hosts.
     #[n(1)]
     Gateway,
-    /// A program that only asks, such as for the status; it may have no endpoints.
+    /// A program that only sends queries, for example for the status. It may have no endpoints.
     #[n(2)]
     Tool,
 }
 
-/// Whether an endpoint stands for itself or for others.
+/// Tells whether an endpoint stands for itself or for others.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Encode, Decode, Serialize)]
 #[cbor(index_only)]
 #[serde(rename_all = "snake_case")]
 pub enum EndpointRole {
-    /// For itself.
+    /// An endpoint of an application, which stands for itself.
     #[n(0)]
     Application,
     /// A local ring that stands in for a publisher on another host.
@@ -65,10 +65,10 @@ pub struct SessionHello {
     /// The protocol that the session speaks.
     #[n(0)]
     pub protocol: u32,
-    /// The session.
+    /// The session's id.
     #[n(1)]
     pub session: SessionId,
-    /// What kind it is.
+    /// The kind of the session.
     #[n(2)]
     pub role: SessionRole,
     /// The process's name, for people.
@@ -77,75 +77,75 @@ pub struct SessionHello {
     /// `ROS_DOMAIN_ID`.
     #[n(4)]
     pub domain: u32,
-    /// Effective security settings: variable, and value or digest.
+    /// The effective security settings: each variable with its value or a digest.
     #[n(5)]
     pub settings: Vec<(String, String)>,
-    /// Why it shares no memory, if so: then it is relayed, and has no descriptors.
+    /// The reason why the session shares no memory. If set, the session is relayed and sends no descriptors.
     #[n(6)]
     pub relay: Option<String>,
-    /// Discovery range: 0 subnet, 1 localhost, 2 off. Absent where an older library opened it.
+    /// The discovery range: 0 subnet, 1 localhost, 2 off. Absent if an older library opened the session.
     #[n(7)]
     pub range: Option<u8>,
-    /// Static peers: addresses or host names; absent is none.
+    /// The static peers: addresses or host names. Absent for none.
     #[n(8)]
     pub static_peers: Option<Vec<String>>,
 }
 
-/// The daemon takes the session.
+/// The daemon accepts the session.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct Welcome {
     /// The protocol that the daemon speaks.
     #[n(0)]
     pub protocol: u32,
-    /// The daemon.
+    /// The daemon's id.
     #[n(1)]
     pub daemon: DaemonId,
-    /// Its process.
+    /// The id of the daemon's process.
     #[n(2)]
     pub pid: u32,
-    /// Whether it applies the range and the static peers of each session. An older daemon has one
-    /// range for all.
+    /// True if the daemon applies the range and the static peers of each session. An older daemon has one range for all
+    /// sessions.
     #[n(3)]
     pub ranges: Option<bool>,
 }
 
-/// The daemon does not take the session, or one of its endpoints.
+/// The daemon refuses the session, or one of its endpoints.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct SessionRefused {
-    /// The variable that differs; empty when none does.
+    /// The variable that differs; empty if none does.
     #[n(0)]
     pub variable: String,
-    /// Its value in the session.
+    /// The value in the session.
     #[n(1)]
     pub ours: String,
-    /// Its value in the daemon.
+    /// The value in the daemon.
     #[n(2)]
     pub theirs: String,
-    /// What is wrong.
+    /// The reason.
     #[n(3)]
     pub text: String,
-    /// The endpoint that is refused; `None` when it is not one.
+    /// The endpoint that is refused; `None` if the refusal is not about one.
     #[n(4)]
     pub endpoint: Option<Gid>,
 }
 
 impl SessionRefused {
-    /// For a reason that no variable is to blame for.
+    /// Creates a refusal that no variable causes.
     pub fn because(text: String) -> Self {
         let [variable, ours, theirs] = [const { String::new() }; 3];
         Self { variable, ours, theirs, text, endpoint: None }
     }
 
-    /// Of one endpoint.
+    /// Creates a refusal of an endpoint.
     pub fn of(endpoint: &Endpoint, why: &str) -> Self {
         let text = format!("endpoint {} of topic {:?}: {why}", endpoint.gid, endpoint.topic);
         Self { endpoint: Some(endpoint.gid), ..Self::because(text) }
     }
 }
 
-/// An endpoint exists. Repeating it changes only which endpoints it stands for.
+/// An endpoint exists. A repetition changes only the endpoints that it stands for.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct Announce {
@@ -158,10 +158,10 @@ pub struct Announce {
     /// The remote subscriptions that a relay stands for.
     #[n(2)]
     pub stands_for: Vec<Gid>,
-    /// Where a writer's ring is in its session's memory.
+    /// The location of a writer's ring in its session's memory.
     #[n(3)]
     pub ring: Option<Location>,
-    /// The only writer that a relay reads; `None` when it reads all that go with it.
+    /// The only writer that a relay reads; `None` if it reads all that match.
     #[n(4)]
     pub only: Option<Gid>,
 }
@@ -170,7 +170,7 @@ pub struct Announce {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct Gone {
-    /// Which.
+    /// The endpoint's GID.
     #[n(0)]
     pub gid: Gid,
 }
@@ -182,35 +182,35 @@ pub struct GraphItem {
     /// The endpoint.
     #[n(0)]
     pub endpoint: Endpoint,
-    /// The daemon it belongs to when that is another host's.
+    /// The daemon to which it belongs, if it is on another host.
     #[n(1)]
     pub daemon: Option<DaemonId>,
-    /// To the gateway, of an endpoint of this host: how far its session is discovered.
+    /// Only to the gateway, for an endpoint of this host: the discovery range of its session.
     #[n(2)]
     pub reach: Option<EndpointRange>,
 }
 
-/// A change of the graph, or a part of the whole of it.
+/// A change of the graph, or a part of the whole graph.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct SessionGraph {
     /// The version after this change.
     #[n(0)]
     pub version: u64,
-    /// Set in the first part of a whole graph: forget what was known.
+    /// Set in the first part of a whole graph: the receiver forgets what it knew.
     #[n(1)]
     pub whole: bool,
-    /// Endpoints that are new.
+    /// The new endpoints.
     #[n(2)]
     pub added: Vec<GraphItem>,
-    /// Endpoints that are gone.
+    /// The endpoints that are gone.
     #[n(3)]
     pub removed: Vec<Gid>,
-    /// Whether another part of the same change follows.
+    /// True if another part of the same change follows.
     #[n(4)]
     pub more: bool,
-    /// Those of this host's own endpoints that ended. A session that is attached to one lets go of it; an
-    /// endpoint of another host is attached to by way of its stand-in, which ends by UNMATCH.
+    /// The endpoints of this host that ended. A session that is attached to one detaches from it. An endpoint of
+    /// another host is attached through its stand-in, which ends by UNMATCH.
     #[n(5)]
     pub ended: Option<Vec<Gid>>,
 }
@@ -240,23 +240,23 @@ pub struct Attach {
     /// The reader's lane in its session's memory.
     #[n(2)]
     pub lane: Location,
-    /// What the reader requests.
+    /// The QoS that the reader requests.
     #[n(3)]
     pub qos: Qos,
     /// The reader's session.
     #[n(4)]
     pub session: SessionId,
-    /// The subscriptions elsewhere that a relay stands for; `None` of a reader that is none.
+    /// The remote subscriptions that a relay stands for; `None` for a reader that is no relay.
     #[n(5)]
     pub stands_for: Option<Vec<Gid>>,
-    /// The segments of the reader's session that come along.
+    /// The segments of the reader's session that come with the message.
     #[n(6)]
     pub segments: Vec<Segment>,
-    /// The last number that a reader has of the writer that was attached before: it goes on behind it.
+    /// The last number that the reader has from the writer, if it was attached before. It continues after that.
     #[n(7)]
     pub after: Option<u64>,
-    /// Set where it carries samples to another process: they are taken when that process has them, and
-    /// kept for it for a while when the reader's own ends.
+    /// Set if the reader carries samples to another process. They count as taken when that process has them, and are
+    /// kept for it for a while if the reader's own process ends.
     #[n(8)]
     pub carries: Option<bool>,
 }
@@ -283,19 +283,18 @@ pub struct Granted {
     /// The writer's ring in its session's memory.
     #[n(5)]
     pub ring: Location,
-    /// The segments of the writer's session that come along.
+    /// The segments of the writer's session that come with the message.
     #[n(6)]
     pub segments: Vec<Segment>,
-    /// The number of the writer's last sample in front of the first position.
+    /// The number of the writer's last sample before the first position.
     #[n(7)]
     pub after: Option<u64>,
-    /// Set where its samples come from a process that shares no memory: numbers that are missing were
-    /// lost on the way.
+    /// Set if the samples come from a process that shares no memory. Then missing numbers were lost on the way.
     #[n(8)]
     pub relayed: Option<bool>,
 }
 
-/// A reader and a writer have nothing to do with each other any more.
+/// A reader and a writer are no longer matched.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct Unmatch {
@@ -305,19 +304,19 @@ pub struct Unmatch {
     /// The writer's GID.
     #[n(1)]
     pub writer: Gid,
-    /// Why.
+    /// The reason.
     #[n(2)]
     pub reason: String,
 }
 
-/// A slice of the status.
+/// A part of the status.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct StatusPart {
-    /// Its number, from 0.
+    /// The number of the part, from 0.
     #[n(0)]
     pub part: u32,
-    /// How many there are.
+    /// The number of parts.
     #[n(1)]
     pub parts: u32,
     /// The bytes of the JSON text.
@@ -325,15 +324,15 @@ pub struct StatusPart {
     pub text: Vec<u8>,
 }
 
-/// With whom an endpoint of a relayed session is matched outside of its process; from the session, the
-/// clients of a server for which there is what stands for them in its process.
+/// The endpoints outside the process of a relayed session with which one of its endpoints is matched. From the session:
+/// the clients of a server for which its process has stand-ins.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct RelayMatched {
     /// The endpoint.
     #[n(0)]
     pub gid: Gid,
-    /// The others.
+    /// The matched endpoints.
     #[n(1)]
     pub others: Vec<Gid>,
 }
@@ -345,113 +344,111 @@ pub struct SampleFragment {
     /// Its publisher, client or server.
     #[n(0)]
     pub publisher: Gid,
-    /// Present in the first fragment alone.
+    /// Set only in the first fragment.
     #[n(1)]
     pub head: Option<SampleHeader>,
-    /// The bytes that follow those of the part before.
+    /// The bytes, which follow those of the previous fragment.
     #[cbor(n(2), with = "minicbor::bytes")]
     pub bytes: Vec<u8>,
-    /// Whose response it is, of a server.
+    /// For a server: the client whose response it is.
     #[n(3)]
     pub client: Option<Gid>,
 }
 
-/// What goes with a sample that crosses a relay.
+/// The metadata of a sample that crosses a relay.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
 pub struct SampleHeader {
     /// Its length in bytes.
     #[n(0)]
     pub length: u32,
-    /// The publication's number.
+    /// The sequence number of the publication.
     #[n(1)]
     pub sequence: u64,
-    /// When it was published.
+    /// The source timestamp.
     #[n(2)]
     pub source_timestamp: i64,
-    /// Samples of its publisher that were lost since the one before.
+    /// Number of samples of the publisher that were lost since the previous one.
     #[n(3)]
     pub lost: u64,
-    /// When it was published, in nanoseconds of CLOCK_MONOTONIC; 0, or absent, where its publisher's
-    /// lifespan is infinite.
+    /// The time of publication in nanoseconds of CLOCK_MONOTONIC; 0 or absent if the publisher's lifespan is infinite.
     #[n(4)]
     #[cbor(default)]
     pub published: u64,
 }
 
-/// The receiver of a channel has room.
+/// The receiver of a channel grants credit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct Credit {
     /// The channel's publisher, client or server.
     #[n(0)]
     pub publisher: Gid,
-    /// For so many bytes more.
+    /// The additional bytes that the sender may send.
     #[n(1)]
     pub bytes: u64,
-    /// In the first that it says of this channel: how many MATCHED it has heard by then.
+    /// Set in the first credit of a channel: the number of MATCHED messages that the receiver has received by then.
     #[n(2)]
     pub opens: Option<u64>,
-    /// Of a server, the client whose responses are the channel.
+    /// For a server: the client whose responses are the channel.
     #[n(3)]
     pub client: Option<Gid>,
-    /// The number of the sample that used the bytes, and is where it is to go.
+    /// The number of the sample that used the bytes and has reached its destination.
     #[n(4)]
     pub done: Option<u64>,
 }
 
-/// Publishers that were alive since their end of a relay said so last.
+/// Publishers that asserted their liveliness since the previous message.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct Asserted {
-    /// Which.
+    /// The publishers.
     #[n(0)]
     pub publishers: Vec<Gid>,
 }
 
-/// Something that writes has ended, or has come back, while what it has written is still on its way to
-/// a ring: it is in no graph and nobody counts it, and those who read it get the rest.
+/// A writer has ended, or has come back, while its samples are still on their way to a ring. A writer that leaves is in
+/// no graph and not counted, but its readers get the rest.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct WriterLeaving {
-    /// What.
+    /// The writer's GID.
     #[n(0)]
     pub gid: Gid,
-    /// Whether it has ended.
+    /// True if it has ended.
     #[n(1)]
     pub leaving: bool,
 }
 
-/// A relay does not get samples where they are to go: their publisher learns of it.
+/// A relay could not deliver samples. Their publisher is told.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct RelayGivenUp {
-    /// The relay; the publisher itself where its session is relayed.
+    /// The relay; for a relayed session, the publisher itself.
     #[n(0)]
     pub reader: Gid,
     /// The publisher.
     #[n(1)]
     pub writer: Gid,
-    /// How many.
+    /// The number of samples.
     #[n(2)]
     pub samples: u64,
 }
 
-/// A session asks whether all that it said of one of its publishers was sent to those who read it: the
-/// memory in which they find its samples, and what it granted. The daemon answers with the same message
-/// once it was.
+/// A session asks whether everything that it sent about one of its publishers has been sent to the publisher's readers:
+/// the memory with its samples, and its grants. The daemon answers with the same message once it has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct Fence {
     /// The publisher.
     #[n(0)]
     pub writer: Gid,
-    /// A number of the session's own, which tells its questions apart.
+    /// The session's number for this question.
     #[n(1)]
     pub number: u64,
 }
 
-/// A publisher has ended, and a reader never took up what it was granted: the reader counts the samples as lost. A reader
-/// that did take it up counts for itself.
+/// A publisher has ended, and a reader never took up its grant. The reader counts the samples as lost. A reader that
+/// did take up its grant counts its losses itself.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct Unmet {
@@ -461,34 +458,34 @@ pub struct Unmet {
     /// The publisher.
     #[n(1)]
     pub writer: Gid,
-    /// How many there were for the reader, of which it would have taken no more than its depth.
+    /// The number of samples for the reader; the reader would have taken at most its depth of them.
     #[n(2)]
     pub samples: u64,
 }
 
-/// Uses that one question about access rules is about, at most.
+/// Most uses in one question about access rules.
 pub const MOST_CHECKED: usize = 32;
 
-/// A tool asks what access rules of a linked peer let this host do there. Answered as a STATUS_REQUEST is.
+/// A tool asks what the access rules of a linked peer let this host do there. Answered like a STATUS_REQUEST.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(map)]
 pub struct AccessCheck {
     /// The peer.
     #[n(0)]
     pub daemon: DaemonId,
-    /// What this host would do there.
+    /// The uses that this host would make there.
     #[n(1)]
     pub uses: Vec<CheckedUse>,
 }
 
-/// One use of a topic or service that access rules are asked about.
+/// A use of a topic or service that access rules are asked about.
 #[derive(Clone, Debug, PartialEq, Eq, Encode, Decode)]
 #[cbor(array)]
 pub struct CheckedUse {
     /// 0 publish, 1 subscribe, 2 serve, 3 call, 4 see.
     #[n(0)]
     pub verb: u8,
-    /// Topic, service or node.
+    /// The topic, service or node.
     #[n(1)]
     pub name: String,
 }
@@ -509,7 +506,7 @@ pub enum SessionMessage {
     Detach(Pair),
     Unmatch(Unmatch),
     StatusRequest,
-    /// Read the settings that may change while the daemon runs. Answered as a STATUS_REQUEST is.
+    /// Re-reads the settings that may change while the daemon runs. Answered like a STATUS_REQUEST.
     Reload,
     AccessCheck(AccessCheck),
     Status(StatusPart),
@@ -525,6 +522,6 @@ pub enum SessionMessage {
     SampleFragment(SampleFragment),
     Credit(Credit),
     Asserted(Asserted),
-    /// A type that this version does not know; to be skipped.
+    /// A message type that this version does not know; it is skipped.
     Unknown(u8),
 }

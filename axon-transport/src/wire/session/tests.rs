@@ -1,4 +1,4 @@
-//! Tests decoding of packets from any sender.
+//! Tests the decoding of packets from any sender.
 
 use proptest::prelude::*;
 
@@ -147,7 +147,7 @@ fn hostile_packets_are_errors() {
         Err(CodecError::TooLarge(n)) if n == MAX_PACKET + 1
     ));
     assert!(matches!(SessionMessage::decode(&[7]), Err(CodecError::Malformed { kind: 7, .. })));
-    // A map without a needed key.
+    // A map without a required key.
     assert!(matches!(SessionMessage::decode(&[5, 0xa0]), Err(CodecError::Malformed { .. })));
     // An array that claims 2^32 elements allocates nothing.
     assert!(SessionMessage::decode(&[6, 0xa1, 3, 0x9a, 0xff, 0xff, 0xff, 0xff]).is_err());
@@ -164,7 +164,7 @@ fn hostile_packets_are_errors() {
 #[test]
 fn unknown_types_and_keys_are_skipped() {
     assert_eq!(SessionMessage::decode(&[200, 1, 2, 3]).unwrap(), SessionMessage::Unknown(200));
-    // { 0: pid, 1: .., 99: [1, {2: 3}] } for WELCOME with one key more.
+    // { 0: pid, 1: .., 99: [1, {2: 3}] } for WELCOME, with one unknown key.
     let mut packet = vec![2];
     let mut e = minicbor::Encoder::new(&mut packet);
     e.map(4).unwrap();
