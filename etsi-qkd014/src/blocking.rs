@@ -1,4 +1,4 @@
-//! The client without async: the same requests, errors and checks, on a runtime of its own.
+//! The client without async: the same requests, errors and checks, on its own runtime.
 //!
 //! ```no_run
 //! # fn example() -> Result<(), etsi_qkd014::Error> {
@@ -19,8 +19,8 @@ use crate::{ClientBuilder, DecKeys, EncKeys, Error, KeyContainer, Status};
 
 /// A blocking client of one KME. Cheap to clone; calls may be made from several threads at once.
 ///
-/// Not for use inside an async runtime, nor on a thread of its `spawn_blocking`: a call there is
-/// refused with [`Error::Request`]. Use [`Client`](crate::Client) there.
+/// It must not be used inside an async runtime, nor on a thread of its `spawn_blocking`: such a
+/// call returns [`Error::Request`]. Use [`Client`](crate::Client) there.
 #[derive(Clone, Debug)]
 pub struct Client {
     client: crate::Client,
@@ -28,10 +28,10 @@ pub struct Client {
 }
 
 impl Client {
-    /// Makes the client from its settings, and a thread that drives its connections.
+    /// Creates the client from its settings, and starts a thread that drives its connections.
     ///
     /// # Errors
-    /// [`Error::Config`], as [`ClientBuilder::build`], or where the thread cannot be started.
+    /// [`Error::Config`] as in [`ClientBuilder::build`], or if the thread cannot be started.
     pub fn new(settings: ClientBuilder) -> Result<Self, Error> {
         let client = settings.build()?;
         let runtime = Builder::new_multi_thread()
@@ -46,15 +46,15 @@ impl Client {
     /// See [`Client::status`](crate::Client::status).
     ///
     /// # Errors
-    /// As there.
+    /// The errors of [`Client::status`](crate::Client::status).
     pub fn status(&self, slave_sae: &str) -> Result<Status, Error> {
         self.block_on(self.client.status(slave_sae))
     }
 
-    /// Asks for fresh keys; `request` sets what is asked for. See [`EncKeys::send`].
+    /// Requests fresh keys; `request` sets the details. See [`EncKeys::send`].
     ///
     /// # Errors
-    /// As there.
+    /// The errors of [`EncKeys::send`].
     pub fn enc_keys(
         &self,
         slave_sae: &str,
@@ -63,10 +63,10 @@ impl Client {
         self.block_on(request(self.client.enc_keys(slave_sae)).send())
     }
 
-    /// Asks for keys by their IDs; `request` names them. See [`DecKeys::send`].
+    /// Requests keys by their IDs, which `request` sets. See [`DecKeys::send`].
     ///
     /// # Errors
-    /// As there.
+    /// The errors of [`DecKeys::send`].
     pub fn dec_keys(
         &self,
         master_sae: &str,
@@ -85,10 +85,10 @@ impl Client {
     }
 }
 
-/// Owns nothing but the order of shutting down.
+/// Shuts the runtime down without waiting for it.
 impl Drop for Client {
     fn drop(&mut self) {
-        // A plain drop of a runtime waits for it, and panics inside another runtime.
+        // Dropping a runtime waits for it, and panics inside another runtime.
         if let Some(runtime) = Arc::get_mut(&mut self.runtime).and_then(Option::take) {
             runtime.shutdown_background();
         }

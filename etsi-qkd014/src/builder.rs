@@ -1,4 +1,4 @@
-//! Settings of a client.
+//! The settings of a client.
 
 use std::fmt;
 use std::fs::File;
@@ -12,16 +12,16 @@ use crate::secret::SecretBuf;
 use crate::tls::{self, Identity};
 use crate::{Client, Error, Quirks, RetryPolicy};
 
-/// How long an idle connection is kept. Shorter than the common keep-alive time of servers (5 s),
-/// so that a request is not written to a connection that the KME is just closing: such a call
-/// would have to be reported as [`Error::KeyPossiblyConsumed`].
+/// Time for which an idle connection is kept. It is shorter than the common keep-alive time of servers (5 s), so that a
+/// request is not written to a connection that the KME is just closing: such a call would have to be reported as
+/// [`Error::KeyPossiblyConsumed`].
 const IDLE: Duration = Duration::from_secs(4);
 
-/// Largest file read as a certificate or key.
+/// Largest file read as a certificate or key, in bytes.
 const MAX_FILE: usize = 1 << 20;
 
-/// Sets up a [`Client`]. Required: [`kme_url`](Self::kme_url), [`ca`](Self::ca),
-/// [`sae_cert`](Self::sae_cert) and [`sae_key`](Self::sae_key), the last three also as files.
+/// Builds a [`Client`]. Required are [`kme_url`](Self::kme_url), [`ca`](Self::ca), [`sae_cert`](Self::sae_cert) and
+/// [`sae_key`](Self::sae_key); the last three may also be files.
 #[must_use]
 pub struct ClientBuilder {
     kme_url: Option<String>,
@@ -33,7 +33,7 @@ pub struct ClientBuilder {
     limits: Limits,
 }
 
-/// What holds for each call.
+/// The limits that apply to each call.
 #[derive(Clone, Debug)]
 pub(crate) struct Limits {
     pub(crate) timeout: Duration,
@@ -69,115 +69,112 @@ impl Default for ClientBuilder {
 }
 
 impl ClientBuilder {
-    /// The KME's address, as `https://kme-a.example:8443` or `https://192.0.2.1`. A path is kept
-    /// as a prefix of `/api/v1/keys`.
+    /// Sets the KME's address, as `https://kme-a.example:8443` or `https://192.0.2.1`. A path is kept as a prefix of
+    /// `/api/v1/keys`.
     pub fn kme_url(mut self, url: impl Into<String>) -> Self {
         self.kme_url = Some(url.into());
         self
     }
 
-    /// The CA that must have issued the KME's certificate, PEM (one or several) or DER. No other
-    /// is trusted.
+    /// Sets the CA that must have issued the KME's certificate: PEM (one or several) or DER. No other CA is trusted.
     pub fn ca(mut self, pem_or_der: impl Into<Vec<u8>>) -> Self {
         self.ca = Some(PemSource::Bytes(SecretSlice::from(pem_or_der.into())));
         self
     }
 
-    /// [`ca`](Self::ca), read from a file by [`build`](Self::build).
+    /// Sets a file for [`ca`](Self::ca), which [`build`](Self::build) reads.
     pub fn ca_file(mut self, path: impl Into<PathBuf>) -> Self {
         self.ca = Some(PemSource::File(path.into()));
         self
     }
 
-    /// The SAE's certificate, PEM (with its intermediates, if any) or DER.
+    /// Sets the SAE's certificate: PEM (with any intermediates) or DER.
     pub fn sae_cert(mut self, pem_or_der: impl Into<Vec<u8>>) -> Self {
         self.sae_cert = Some(PemSource::Bytes(SecretSlice::from(pem_or_der.into())));
         self
     }
 
-    /// [`sae_cert`](Self::sae_cert), read from a file by [`build`](Self::build).
+    /// Sets a file for [`sae_cert`](Self::sae_cert), which [`build`](Self::build) reads.
     pub fn sae_cert_file(mut self, path: impl Into<PathBuf>) -> Self {
         self.sae_cert = Some(PemSource::File(path.into()));
         self
     }
 
-    /// The SAE's private key, PEM or DER: PKCS#8, SEC1 or PKCS#1. Zeroized after
-    /// [`build`](Self::build).
+    /// Sets the SAE's private key, PEM or DER: PKCS#8, SEC1 or PKCS#1. It is zeroized after [`build`](Self::build).
     ///
-    /// A `Vec<u8>` is taken as it is where its capacity is its length. Otherwise the allocator shrinks
-    /// it, and may leave a copy behind: give a `Box<[u8]>` or a `SecretSlice` then.
+    /// A `Vec<u8>` is used without a copy if its capacity equals its length. Otherwise the allocator shrinks it, and
+    /// may leave a copy behind. In that case pass a `Box<[u8]>` or a `SecretSlice`.
     pub fn sae_key(mut self, pem_or_der: impl Into<SecretSlice<u8>>) -> Self {
         self.sae_key = Some(PemSource::Bytes(pem_or_der.into()));
         self
     }
 
-    /// [`sae_key`](Self::sae_key), read from a file by [`build`](Self::build).
+    /// Sets a file for [`sae_key`](Self::sae_key), which [`build`](Self::build) reads.
     pub fn sae_key_file(mut self, path: impl Into<PathBuf>) -> Self {
         self.sae_key = Some(PemSource::File(path.into()));
         self
     }
 
-    /// The KME's ID, which must be the common name in its certificate's subject, in addition to
-    /// the check of the host name or address in the URL.
+    /// Sets the KME's ID, which must be the common name in the subject of its certificate. This is checked in addition
+    /// to the host name or address in the URL.
     ///
-    /// Clause 5.1 asks an SAE to confirm the KME's ID from its certificate before anything else.
-    /// Left out, the host name or address stands for that ID: any certificate of the
-    /// [`ca`](Self::ca) for the host in the URL is taken. Give it wherever one CA issues
-    /// certificates to several KMEs, or to other servers.
+    /// Clause 5.1 asks an SAE to confirm the KME's ID from its certificate before anything else. Without this setting,
+    /// the host name or address stands for the ID: any certificate of the [`ca`](Self::ca) for the host in the URL is
+    /// accepted. Set it if one CA issues certificates to several KMEs, or to other servers.
     pub fn kme_id(mut self, id: impl Into<String>) -> Self {
         self.identity.kme_id = Some(id.into());
         self
     }
 
-    /// Trust the [`kme_id`](Self::kme_id) alone and do not compare the certificate with the host
-    /// name, for KMEs whose certificates carry no name. The specification lets a KME be known by
-    /// its ID; the CA must then be one that names each KME truthfully.
+    /// Trusts the [`kme_id`](Self::kme_id) alone, and does not compare the certificate with the host name: for KMEs
+    /// whose certificates contain no host name. The specification lets a KME be identified by its ID. The CA must then
+    /// name each KME truthfully.
     pub fn kme_id_replaces_name_check(mut self) -> Self {
         self.identity.check_name = false;
         self
     }
 
-    /// Time for TCP and TLS. Default 3 s. Keep it below [`timeout`](Self::timeout): a call that
-    /// runs out of time while it connects has certainly not consumed a key.
+    /// Sets the time for TCP and TLS. Default 3 s. Keep it below [`timeout`](Self::timeout): a call that runs out of
+    /// time while it connects has certainly not consumed a key.
     pub fn connect_timeout(mut self, time: Duration) -> Self {
         self.connect_timeout = time;
         self
     }
 
-    /// Time for one try, from connecting to the last byte of the answer. Default 10 s.
+    /// Sets the time for one attempt, from connecting to the last byte of the answer. Default 10 s.
     pub fn timeout(mut self, time: Duration) -> Self {
         self.limits.timeout = time;
         self
     }
 
-    /// Time for a whole call with its repeats and pauses. Default 30 s.
+    /// Sets the time for a whole call with its repeats and pauses. Default 30 s.
     pub fn deadline(mut self, time: Duration) -> Self {
         self.limits.deadline = time;
         self
     }
 
-    /// Largest answer accepted, bytes, whatever its Content-Length says. Default 1 MiB.
+    /// Sets the largest accepted answer in bytes, whatever its Content-Length says. Default 1 MiB.
     pub fn max_body(mut self, bytes: usize) -> Self {
         self.limits.max_body = bytes;
         self
     }
 
-    /// When calls are repeated.
+    /// Sets when calls are repeated.
     pub fn retry(mut self, policy: RetryPolicy) -> Self {
         self.limits.retry = policy;
         self
     }
 
-    /// Deviations to tolerate. Default none.
+    /// Sets the deviations to tolerate. Default none.
     pub fn quirks(mut self, quirks: Quirks) -> Self {
         self.limits.quirks = quirks;
         self
     }
 
-    /// Reads the files named and makes the client. Nothing is sent.
+    /// Reads the files and creates the client. Sends nothing.
     ///
     /// # Errors
-    /// [`Error::Config`] names the setting that is missing or unusable.
+    /// [`Error::Config`] names the missing or unusable setting.
     pub fn build(self) -> Result<Client, Error> {
         let (base, kme) = base_url(self.kme_url)?;
         if !self.identity.check_name && self.identity.kme_id.is_none() {
@@ -238,12 +235,12 @@ fn config(setting: &'static str, reason: impl Into<String>) -> Error {
     Error::Config { setting, reason: reason.into() }
 }
 
-/// A URL as errors show it: not where it may hold a password.
+/// Returns a URL for errors, without its text if that may contain a password.
 fn shown(url: &str) -> &str {
     if url.contains('@') { "(a URL with a user name, not shown)" } else { url }
 }
 
-/// The URL below which the methods lie, and host:port for errors.
+/// Returns the URL below which the methods are, and host:port for errors.
 fn base_url(text: Option<String>) -> Result<(Url, String), Error> {
     let text = text.ok_or_else(|| config("kme_url", "is missing"))?;
     let accepted = "accepted: https://host[:port][/prefix]";
@@ -276,7 +273,7 @@ fn read(source: Option<PemSource>, setting: &'static str) -> Result<SecretSlice<
         Some(PemSource::File(path)) => path,
     };
     let fail = |reason: String| config(setting, format!("{}: {reason}", path.display()));
-    // What is no regular file, as a pipe from a password manager, says no length beforehand.
+    // A file that is not regular, such as a pipe from a password manager, does not state its length.
     let file = File::open(&path).map_err(|e| fail(e.to_string()))?;
     match SecretBuf::read_from(file, MAX_FILE).map_err(|e| fail(e.to_string()))? {
         Some(content) => Ok(content.into_secret()),

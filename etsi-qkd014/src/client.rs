@@ -1,4 +1,4 @@
-//! The client: one call is one or more tries, within a deadline.
+//! The client: one call makes one or more attempts within a deadline.
 
 use std::collections::HashMap;
 use std::fmt;
@@ -14,9 +14,9 @@ use crate::{ClientBuilder, DecKeys, EncKeys, Error, RetryPolicy, Status, parse};
 
 /// A client of one KME, acting as one SAE.
 ///
-/// Cheap to clone, and all clones share their connections. Calls may run at the same time from any
-/// task. They need a tokio runtime with time and I/O enabled; programs
-/// without one use the feature `blocking`.
+/// It is cheap to clone, and all clones share their connections. Calls may run concurrently in any
+/// task. They need a tokio runtime with time and I/O enabled; programs without one use the feature
+/// `blocking`.
 ///
 /// A call that is dropped before it ends leaves nothing behind here, but the KME may have served
 /// it: treat the keys of a dropped call as [consumed](Error::KeyPossiblyConsumed).
@@ -31,26 +31,26 @@ struct ClientInner {
     kme: String,
     connect_timeout: Duration,
     limits: Limits,
-    /// The default key size by slave SAE, bits, as the last status had it.
+    /// The default key size in bits by slave SAE, from the last status.
     key_sizes: Arc<Mutex<HashMap<String, u32>>>,
 }
 
-/// Peers whose key size is remembered.
+/// Most peers whose key size is remembered.
 const MAX_PEERS: usize = 1024;
 
 impl Client {
-    /// Starts the settings of a client.
+    /// Returns a builder for a client.
     pub fn builder() -> ClientBuilder {
         ClientBuilder::default()
     }
 
-    /// What the KME holds for keys between this SAE and `slave_sae` (clause 5.2).
+    /// Returns the KME's status for keys between this SAE and `slave_sae` (clause 5.2).
     ///
-    /// The client and its clones remember the `key_size`, to which later answers of
-    /// [`enc_keys`](Self::enc_keys) without a size are held.
+    /// The client and its clones remember the `key_size`. Later answers of
+    /// [`enc_keys`](Self::enc_keys) without a size must have it.
     ///
     /// # Errors
-    /// Any [`Error`] but [`KeyPossiblyConsumed`](Error::KeyPossiblyConsumed).
+    /// Any [`Error`] except [`KeyPossiblyConsumed`](Error::KeyPossiblyConsumed).
     pub async fn status(&self, slave_sae: &str) -> Result<Status, Error> {
         let prepared = Prepared::get(self.url(slave_sae, "status")?);
         let body = self.call(Call::Status, &prepared).await?;
@@ -59,19 +59,20 @@ impl Client {
         Ok(status)
     }
 
-    /// Asks for fresh keys to share with `slave_sae`, as their master (clause 5.3).
+    /// Starts a request for fresh keys to share with `slave_sae`, as their master (clause 5.3).
     pub fn enc_keys(&self, slave_sae: impl Into<String>) -> EncKeys<'_> {
         EncKeys::new(self, slave_sae.into())
     }
 
-    /// Asks for keys that `master_sae` drew, by their key_IDs, as their slave (clause 5.4).
+    /// Starts a request for keys that `master_sae` drew, by their key_IDs, as their slave (clause
+    /// 5.4).
     pub fn dec_keys(&self, master_sae: impl Into<String>) -> DecKeys<'_> {
         DecKeys::new(self, master_sae.into())
     }
 
-    /// This client under another policy of repeats; connections are shared, as with a clone.
+    /// Returns this client with another retry policy. It shares connections, like a clone.
     ///
-    /// For a caller that repeats calls by rules of its own and wants each made once
+    /// For a caller that repeats calls by its own rules and needs each to be made once
     /// ([`RetryPolicy::none`]): repeats within repeats would multiply.
     #[must_use]
     pub fn with_retry(&self, policy: RetryPolicy) -> Self {
@@ -107,7 +108,7 @@ impl Client {
         }
     }
 
-    /// The default key size in bits for a peer, where a status has told one of whole bytes.
+    /// Returns the default key size in bits for a peer, if a status has told one in whole bytes.
     pub(crate) fn key_size(&self, slave_sae: &str) -> Option<u32> {
         let sizes = self.inner.key_sizes.lock().unwrap_or_else(PoisonError::into_inner);
         sizes.get(slave_sae).copied().filter(|bits| *bits > 0 && bits.is_multiple_of(8))
@@ -117,7 +118,7 @@ impl Client {
         &self.inner.limits
     }
 
-    /// The URL of a method; the SAE ID becomes one path segment whatever it holds.
+    /// Returns the URL of a method. The SAE ID becomes one path segment whatever it contains.
     pub(crate) fn url(&self, sae: &str, method: &str) -> Result<Url, Error> {
         check_sae_id(sae)?;
         let mut url = self.inner.base.clone();
@@ -128,7 +129,7 @@ impl Client {
     /// Makes a call with its repeats.
     pub(crate) async fn call(&self, call: Call, prepared: &Prepared) -> Result<Body, Error> {
         let ClientInner { http, kme, connect_timeout, limits, .. } = &*self.inner;
-        // Durations, since a deadline may be set that no clock can tell.
+        // Durations, because no `Instant` can represent some deadlines.
         let began = Instant::now();
         let left = || limits.deadline.saturating_sub(began.elapsed());
         let mut repeat = 0;
@@ -152,7 +153,7 @@ impl Client {
 }
 
 pub(crate) fn check_sae_id(sae: &str) -> Result<(), Error> {
-    // "." and ".." would vanish from a path, and so name another resource.
+    // "." and ".." would be removed from a path, and so name another resource.
     let sane = !sae.is_empty() && sae.len() <= 255 && !matches!(sae, "." | "..");
     if sane && !sae.chars().any(char::is_control) {
         return Ok(());
@@ -186,7 +187,7 @@ fn may_repeat(call: Call, limits: &Limits, repeat: u32, error: &Error, ambiguous
 
 fn pause(limits: &Limits, repeat: u32, error: &Error) -> Duration {
     let mut jitter = [0];
-    // Without randomness the pause is only less spread.
+    // Without randomness, the pauses are only less spread.
     let _ = rustls::crypto::aws_lc_rs::default_provider().secure_random.fill(&mut jitter);
     let pause = limits.retry.pause_before(repeat, jitter[0]);
     match error {

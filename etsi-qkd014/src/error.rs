@@ -1,13 +1,13 @@
-//! One error type whose variants a program can act on.
+//! The error type of this crate. A program can act on its variants.
 //!
-//! No variant ever carries key bytes, an answer body, or the contents of a private key file: a
-//! KME's own words appear only where the specification gives it an error `message`.
+//! No variant ever contains key bytes, an answer body, or the contents of a private key file. Text
+//! of a KME appears only from the error `message` that the specification defines.
 
 use std::time::Duration;
 
 use serde_json::Value;
 
-/// Which end of the connection refused the TLS handshake.
+/// The end of the connection that refused the TLS handshake.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum RefusedBy {
@@ -26,22 +26,22 @@ impl std::fmt::Display for RefusedBy {
     }
 }
 
-/// Why a call to a KME, or the making of a [`Client`](crate::Client), failed.
+/// The reason why a call to a KME, or the creation of a [`Client`](crate::Client), failed.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
     /// A setting of the [`ClientBuilder`](crate::ClientBuilder) is missing or unusable.
     #[error("{setting}: {reason}")]
     Config {
-        /// The builder's method.
+        /// The method of the builder.
         setting: &'static str,
-        /// What was wrong with it, and what is accepted.
+        /// The defect, and the accepted values.
         reason: String,
     },
-    /// The request cannot be put as asked. Nothing was sent.
+    /// The request is not possible. Nothing was sent.
     #[error("request refused before it was sent: {reason}")]
     Request {
-        /// What was asked and what is possible.
+        /// The request, and what is possible.
         reason: String,
     },
     /// No connection: name resolution or TCP failed. Nothing was sent.
@@ -57,68 +57,68 @@ pub enum Error {
     Tls {
         /// Host and port.
         kme: String,
-        /// Who refused.
+        /// The end that refused.
         refused_by: RefusedBy,
-        /// Why, and what to look at.
+        /// The reason, and what to check.
         reason: String,
     },
     /// Status 400 (clauses 5.2 to 5.4): the KME did not accept the request.
     #[error("KME answered 400 Bad Request: {message}")]
     BadRequest {
-        /// The KME's message; empty where its answer held none.
+        /// The KME's message; empty if its answer contained none.
         message: String,
         /// The KME's details (clause 6.5).
         details: Vec<Value>,
     },
-    /// Status 401 (clauses 5.2 to 5.4): this SAE may not do that.
+    /// Status 401 (clauses 5.2 to 5.4): this SAE is not permitted to do that.
     #[error("KME answered 401 Unauthorized: {message}")]
     Unauthorized {
-        /// The KME's message; empty where its answer held none.
+        /// The KME's message; empty if its answer contained none.
         message: String,
         /// The KME's details (clause 6.5).
         details: Vec<Value>,
     },
-    /// Status 503 (clauses 5.2 to 5.4): an error of the server's side; an empty key store is one.
+    /// Status 503 (clauses 5.2 to 5.4): an error of the server, for example an empty key store.
     #[error("KME answered 503 Service Unavailable: {message}")]
     Unavailable {
-        /// The KME's message; empty where its answer held none.
+        /// The KME's message; empty if its answer contained none.
         message: String,
         /// The KME's details (clause 6.5).
         details: Vec<Value>,
-        /// The `Retry-After` header, where it gave seconds.
+        /// The `Retry-After` header, if it is in seconds.
         retry_after: Option<Duration>,
     },
-    /// A status code that the specification does not list. Redirects are among them: they are
-    /// never followed.
+    /// A status code that the specification does not list. Redirects are among them, because they
+    /// are never followed.
     #[error("KME answered status {code}, which ETSI GS QKD 014 does not list: {message}")]
     Status {
         /// The HTTP status code.
         code: u16,
-        /// The KME's message; empty where its answer held none.
+        /// The KME's message; empty if its answer contained none.
         message: String,
     },
-    /// The answer is not what clause 6 describes.
+    /// The answer does not have the form of clause 6.
     #[error("malformed answer, {what}: {reason}")]
     Malformed {
-        /// The part of the answer, as `keys[2].key`.
+        /// The part of the answer, for example `keys[2].key`.
         what: String,
-        /// What is wrong with it; never its text.
+        /// The defect; never the text itself.
         reason: String,
     },
-    /// The answer is well formed and breaks a promise of the specification.
+    /// The answer is well formed but violates a promise of the specification.
     #[error("the KME broke {clause}: expected {expected}, got {got}")]
     Check {
-        /// The clause, as `ETSI GS QKD 014 V1.1.1 clause 6.3`.
+        /// The clause, for example `ETSI GS QKD 014 V1.1.1 clause 6.3`.
         clause: &'static str,
-        /// What the clause and the request ask for.
+        /// What the clause and the request require.
         expected: String,
-        /// What came.
+        /// What the answer contains.
         got: String,
     },
     /// The answer is larger than [`max_body`](crate::ClientBuilder::max_body).
     #[error("the answer is larger than the limit of {limit} bytes")]
     BodyTooLarge {
-        /// The limit, bytes.
+        /// The limit in bytes.
         limit: usize,
     },
     /// Time ran out.
@@ -129,16 +129,16 @@ pub enum Error {
         /// The time allowed.
         after: Duration,
     },
-    /// The connection was lost after the request may have left.
+    /// The connection was lost when the request may already have left.
     #[error("connection lost before the answer was complete: {reason}")]
     Interrupted {
-        /// What happened.
+        /// A description of the failure.
         reason: String,
     },
-    /// `enc_keys` or `dec_keys` failed after the request may have reached the KME. It may have
-    /// handed out, and so destroyed, the keys of this call. What to do next: after `enc_keys`, ask
-    /// for other keys, the lost ones are simply never used; after `dec_keys`, tell the master to
-    /// choose other keys.
+    /// `enc_keys` or `dec_keys` failed when the request may already have reached the KME. The KME
+    /// may have handed out, and so destroyed, the keys of this call. After `enc_keys`, ask for
+    /// other keys; the lost ones are never used. After `dec_keys`, tell the master to choose other
+    /// keys.
     #[error("{call} failed and its keys may be consumed: {cause}")]
     KeyPossiblyConsumed {
         /// `enc_keys` or `dec_keys`.
@@ -150,14 +150,15 @@ pub enum Error {
 }
 
 impl Error {
-    /// Whether keys may have been consumed by the failed call; see
+    /// Returns whether the failed call may have consumed keys; see
     /// [`KeyPossiblyConsumed`](Error::KeyPossiblyConsumed).
     #[must_use]
     pub fn keys_may_be_consumed(&self) -> bool {
         matches!(self, Self::KeyPossiblyConsumed { .. })
     }
 
-    /// The failure itself, below [`KeyPossiblyConsumed`](Error::KeyPossiblyConsumed).
+    /// Returns the failure inside [`KeyPossiblyConsumed`](Error::KeyPossiblyConsumed), or else the
+    /// error itself.
     #[must_use]
     pub fn cause(&self) -> &Self {
         match self {
@@ -166,8 +167,9 @@ impl Error {
         }
     }
 
-    /// Whether the same call may succeed later without anything being changed: the KME was
-    /// unreachable, slow, cut off or answered 503. It says nothing of whether keys were consumed.
+    /// Returns whether the same call may succeed later without any change: the KME was unreachable,
+    /// slow, cut off or answered
+    /// 503. This does not tell whether keys were consumed.
     #[must_use]
     pub fn is_transient(&self) -> bool {
         matches!(
@@ -179,7 +181,7 @@ impl Error {
         )
     }
 
-    /// The HTTP status code, where the KME answered with one other than 200.
+    /// Returns the HTTP status code, if the KME answered with one other than 200.
     #[must_use]
     pub fn status_code(&self) -> Option<u16> {
         match self.cause() {

@@ -1,4 +1,4 @@
-//! One try of a call: request out, bounded answer in, and an honest word on what a failure means.
+//! One attempt of a call: sends a request, reads a bounded answer, and classifies failures.
 
 use std::time::Duration;
 
@@ -12,10 +12,10 @@ use crate::builder::Limits;
 use crate::secret::SecretBuf;
 use crate::{Error, Quirks, parse, tls};
 
-/// The answer of status 200, zeroized on drop.
+/// The answer of status 200; it is zeroized on drop.
 pub(crate) type Body = SecretBuf;
 
-/// Largest body of another status that is read for its message.
+/// Largest body of another status that is read for its message, in bytes.
 const MAX_ERROR_BODY: usize = 64 << 10;
 
 /// The three methods of the interface.
@@ -27,7 +27,7 @@ pub(crate) enum Call {
 }
 
 impl Call {
-    /// Wraps a failure after which keys may be gone. A status consumes none.
+    /// Wraps a failure after which keys may be consumed. A status consumes none.
     pub(crate) fn consumed(self, cause: Error) -> Error {
         let call = match self {
             Self::Status => return cause,
@@ -47,7 +47,7 @@ pub(crate) struct Prepared {
 
 pub(crate) struct ExchangeFailure {
     pub(crate) error: Error,
-    /// The KME may have served the request all the same.
+    /// True if the KME may have served the request in spite of the error.
     pub(crate) ambiguous: bool,
 }
 
@@ -79,7 +79,7 @@ impl Prepared {
         time: Duration,
         limits: &Limits,
     ) -> Result<Body, ExchangeFailure> {
-        // Without the second header any coding would do (RFC 7231, 5.3.4).
+        // Without the second header, any content coding would be acceptable (RFC 7231, 5.3.4).
         let mut request = http
             .request(self.method.clone(), self.url.clone())
             .header(ACCEPT, "application/json")
@@ -88,7 +88,7 @@ impl Prepared {
             request = request.header(CONTENT_TYPE, "application/json").body(body.clone());
         }
         let began = Instant::now();
-        // Connecting has its own, shorter time: the request is taken to have left.
+        // Connecting has its own, shorter timeout, so the request is assumed to have left.
         let late = || ExchangeFailure::ambiguous(Error::Timeout { phase: "answer", after: time });
         let response = timeout(time, request.send())
             .await
@@ -102,7 +102,7 @@ impl Prepared {
     }
 }
 
-/// A failure before there was an answer.
+/// Classifies a failure before there was an answer.
 fn send_failure(error: &reqwest::Error, kme: &str, connect_timeout: Duration) -> ExchangeFailure {
     let connected = !error.is_connect();
     if let Some((refused_by, reason)) =
@@ -120,7 +120,7 @@ fn send_failure(error: &reqwest::Error, kme: &str, connect_timeout: Duration) ->
     })
 }
 
-/// The last reason in the chain: the outer ones repeat the URL.
+/// Returns the innermost reason of the chain: the outer ones repeat the URL.
 fn innermost(error: &reqwest::Error) -> String {
     let mut reason: &dyn std::error::Error = error;
     while let Some(source) = reason.source() {
@@ -160,13 +160,13 @@ fn is_json(response: &Response) -> bool {
     media_type.trim().eq_ignore_ascii_case("application/json")
 }
 
-/// Reads at most `limit` bytes. Content-Length is a hint for the first allocation only.
+/// Reads at most `limit` bytes. Content-Length is only a hint for the first allocation.
 async fn read_body(response: &mut Response, limit: usize) -> Result<Body, Error> {
     let expected = response.content_length().and_then(|length| usize::try_from(length).ok());
     if expected.is_some_and(|length| length > limit) {
         return Err(Error::BodyTooLarge { limit });
     }
-    // Header values share memory with the body's first chunk, which is cleared only when nothing
+    // Header values share memory with the body's first chunk, which can be cleared only if nothing
     // else refers to it.
     response.headers_mut().clear();
     response.extensions_mut().clear();
@@ -187,9 +187,9 @@ async fn read_body(response: &mut Response, limit: usize) -> Result<Body, Error>
     }
 }
 
-/// The chunk read last. As long as it is held, hyper cannot reuse the memory below it and takes
-/// other memory for its next read; so when the next chunk comes, this one either is the last
-/// reference to its memory, or shares it with the next one, which then stands for both.
+/// The chunk that was read last. As long as it is held, hyper cannot reuse its memory and takes
+/// other memory for the next read. So when the next chunk comes, this one either is the last
+/// reference to its memory, or shares it with the next chunk, which then keeps the memory.
 struct Held(Option<Bytes>);
 
 impl Held {
@@ -199,9 +199,9 @@ impl Held {
         }
     }
 
-    /// Gives the connection's task the few turns that it takes to begin its next read, for which
-    /// it takes other memory. Only then can the last chunk be cleared. Where that task runs on
-    /// another thread it may still be late.
+    /// Yields a few times, so that the connection's task begins its next read, for which it takes
+    /// other memory. Only then can the last chunk be cleared. If that task runs on another thread,
+    /// it may still be late.
     async fn settle(&self) {
         for _ in 0..16 {
             if self.0.as_ref().is_none_or(Bytes::is_unique) {
@@ -220,18 +220,19 @@ impl Drop for Held {
     }
 }
 
-/// Zeroizes all the memory that a chunk was cut from, where nothing else refers to it.
+/// Zeroizes all the memory that contains a chunk, if nothing else refers to it.
 fn clear(chunk: Bytes) {
     if let Ok(mut own) = chunk.try_into_mut() {
         own.clear();
-        // Asking for more than there is moves the start back to that of the memory.
+        // Reserving more than the capacity moves the start back to the beginning of the memory.
         let _ = own.try_reclaim(own.capacity() + 1);
         own.resize(own.capacity(), 0);
         zeroize::optimization_barrier(&own[..]);
     }
 }
 
-/// An answer of a status other than 200, which tells what happened whatever becomes of its body.
+/// Classifies an answer with a status other than 200. The status suffices, whatever happens to the
+/// body.
 async fn refused(mut response: Response, left: Duration) -> ExchangeFailure {
     let status = response.status();
     let retry_after = response
@@ -247,7 +248,7 @@ async fn refused(mut response: Response, left: Duration) -> ExchangeFailure {
         400 => ExchangeFailure::clear(Error::BadRequest { message, details }),
         401 => ExchangeFailure::clear(Error::Unauthorized { message, details }),
         503 => ExchangeFailure::clear(Error::Unavailable { message, details, retry_after }),
-        // A redirect or a refusal served nothing; a gateway's 502 or a KME's 500 may have.
+        // A redirect or a refusal has served nothing; a gateway's 502 or a KME's 500 may have.
         code @ (300..=499) => ExchangeFailure::clear(Error::Status { code, message }),
         code => ExchangeFailure::ambiguous(Error::Status { code, message }),
     }

@@ -1,6 +1,6 @@
-//! Entry points for fuzz targets. Not part of the API: they may change in any release.
+//! Entry points for fuzz targets. They are not part of the API and may change in any release.
 //!
-//! Each returns whether the input was accepted, and panics where what was accepted breaks a promise
+//! Each returns whether the input was accepted, and panics if the accepted value breaks a promise
 //! of this crate.
 
 use std::collections::HashSet;
@@ -10,14 +10,14 @@ use secrecy::ExposeSecret;
 use crate::parse::{self, Asked};
 use crate::{KeyContainer, Quirks};
 
-/// The quirks that `bits` select.
+/// Returns the quirks that `bits` select.
 fn quirks(bits: [u8; 2]) -> Quirks {
     let bits = u16::from_le_bytes(bits);
     let chosen = Quirks::NAMES.iter().enumerate().filter(|(i, _)| bits >> i & 1 == 1);
     chosen.fold(Quirks::STRICT, |all, (_, (_, quirk))| all | *quirk)
 }
 
-/// The first two bytes select quirks, the rest is the body.
+/// Parses a status. The first two bytes select quirks, the rest is the body.
 pub fn status_response(data: &[u8]) -> bool {
     let Some((&bits, body)) = data.split_first_chunk::<2>() else { return false };
     let status = parse::status(body, "sae-b", quirks(bits));
@@ -27,7 +27,8 @@ pub fn status_response(data: &[u8]) -> bool {
     })
 }
 
-/// The first two bytes select quirks, the third the number of keys asked for, the rest is the body.
+/// Parses a key container. The first two bytes select quirks, the third the number of keys, the
+/// rest is the body.
 pub fn key_container(data: &[u8]) -> bool {
     let Some((&[low, high, number], body)) = data.split_first_chunk::<3>() else { return false };
     let bits = [low, high];
@@ -40,7 +41,7 @@ pub fn key_container(data: &[u8]) -> bool {
         "bc490419-7d60-487f-adc1-4ddcc177c139".to_owned(),
         "0a782fb5-3434-48fe-aa4d-14f41d46cf92".to_owned(),
     ];
-    // One of them, or both in the other order.
+    // One of the IDs, or both in the other order.
     let ids = if number % 2 == 1 { &ids[..1] } else { &ids[..] };
     let by_id = parse::key_container(body, &Asked::Ids(ids), Some(256), quirks(bits));
     if let Ok(container) = &by_id {
@@ -51,7 +52,7 @@ pub fn key_container(data: &[u8]) -> bool {
     by_number.is_ok() || by_id.is_ok()
 }
 
-/// As many as asked for, of one size, under distinct and sane key_IDs.
+/// Checks that there are `number` keys, of one size, with distinct and valid key_IDs.
 fn check(container: &KeyContainer, number: usize) {
     let keys = &container.keys;
     assert_eq!(keys.len(), number);
@@ -61,14 +62,14 @@ fn check(container: &KeyContainer, number: usize) {
     assert!(ids.iter().all(|id| parse::is_key_id(id)));
 }
 
-/// The body of an answer other than 200.
+/// Parses the body of an answer other than 200.
 pub fn error_response(data: &[u8]) -> bool {
     let answer = parse::error_answer(data);
     assert!(answer.message.len() < 600 && !answer.message.contains(char::is_control));
     !answer.message.is_empty()
 }
 
-/// The subject of a certificate.
+/// Parses the subject of a certificate.
 pub fn certificate_subject(data: &[u8]) -> bool {
     let subject = crate::subject::common_name_in(data);
     let certificate = crate::subject::common_name(&data.into());

@@ -6,9 +6,9 @@ use subtle::{Choice, ConstantTimeEq};
 
 /// A key from a KME and its key_ID.
 ///
-/// The secret is zeroized on drop. It is neither `Clone` nor `Debug` nor `Display`, and comes out
-/// only through [`ExposeSecret`], [`expose_array`](Key::expose_array) and
-/// [`into_secret`](Key::into_secret). Equality compares the secrets, and only them, in constant time.
+/// The secret is zeroized on drop. It is neither `Clone` nor `Debug` nor `Display`. It is accessible only through
+/// [`ExposeSecret`], [`expose_array`](Key::expose_array) and [`into_secret`](Key::into_secret). Equality compares only
+/// the secrets, in constant time.
 ///
 /// ```compile_fail
 /// fn clone_it<T: Clone>() {}
@@ -39,46 +39,46 @@ impl Key {
         self.key_id = asked;
     }
 
-    /// The key_ID: from `enc_keys` exactly as the KME spelled it, from `dec_keys` exactly as you
-    /// asked for it (a KME may answer in another letter case).
+    /// Returns the key_ID: from `enc_keys` exactly as the KME spelled it, from `dec_keys` exactly as it was requested
+    /// (a KME may answer in another letter case).
     #[must_use]
     pub fn key_id(&self) -> &str {
         &self.key_id
     }
 
-    /// The secret itself, where it is exactly `N` bytes long.
+    /// Returns the secret, if it is exactly `N` bytes long.
     #[must_use]
     pub fn expose_array<const N: usize>(&self) -> Option<&[u8; N]> {
         self.expose_secret().try_into().ok()
     }
 
-    /// The secret without its key_ID, for code that takes keys in this form. Nothing is copied.
+    /// Returns the secret without its key_ID, for code that takes keys in this form. Nothing is copied.
     #[must_use]
     pub fn into_secret(self) -> SecretSlice<u8> {
         self.secret
     }
 
-    /// Length of the secret in bytes; never 0.
+    /// Returns the length of the secret in bytes; never 0.
     #[must_use]
     #[allow(clippy::len_without_is_empty, reason = "a key is never empty")]
     pub fn len(&self) -> usize {
         self.expose_secret().len()
     }
 
-    /// The KME's `key_ID_extension` (clause 6.3).
+    /// Returns the KME's `key_ID_extension` (clause 6.3).
     #[must_use]
     pub fn key_id_extension(&self) -> Option<&Value> {
         self.key_id_extension.as_ref()
     }
 
-    /// The KME's `key_extension` (clause 6.3).
+    /// Returns the KME's `key_extension` (clause 6.3).
     #[must_use]
     pub fn extension(&self) -> Option<&Value> {
         self.extension.as_ref()
     }
 }
 
-/// The secret itself.
+/// Exposes the secret.
 impl ExposeSecret<[u8]> for Key {
     fn expose_secret(&self) -> &[u8] {
         self.secret.expose_secret()
@@ -99,17 +99,17 @@ impl PartialEq for Key {
 
 impl Eq for Key {}
 
-/// The keys of one answer (clause 6.3): always as many as were asked for, at least one.
+/// The keys of one answer (clause 6.3): always as many as were requested, at least one.
 #[non_exhaustive]
 pub struct KeyContainer {
-    /// The keys; after `dec_keys` in the order in which they were asked for.
+    /// The keys; after `dec_keys` in the order of the request.
     pub keys: Vec<Key>,
     /// The KME's `key_container_extension`.
     pub extension: Option<Value>,
 }
 
 impl KeyContainer {
-    /// The first key, for calls that asked for one. Others are dropped and zeroized.
+    /// Returns the first key, for a call that requested one. Other keys are dropped and zeroized.
     #[must_use]
     pub fn into_single(self) -> Key {
         self.keys.into_iter().next().expect("a checked container is never empty")

@@ -1,5 +1,5 @@
-//! A private key out of PEM text (RFC 7468), with no copy left behind: the parser of
-//! rustls-pki-types, which is right for certificates, frees the base64 text as it is.
+//! Reads a private key from PEM text (RFC 7468) without leaving a copy behind. The parser of
+//! rustls-pki-types, which is used for certificates, frees the base64 text without erasing it.
 
 use rustls::pki_types::{PrivateKeyDer, PrivatePkcs1KeyDer, PrivatePkcs8KeyDer, PrivateSec1KeyDer};
 use secrecy::{ExposeSecret, SecretSlice};
@@ -7,7 +7,7 @@ use zeroize::Zeroizing;
 
 use crate::parse::base64_text;
 
-/// What a section of PEM text holds.
+/// The content of a section of PEM text.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Form {
     Pkcs8,
@@ -22,8 +22,8 @@ pub(crate) struct PrivateKey {
 }
 
 impl PrivateKey {
-    /// The first private key of the text; `None` where there is none that can be read, as where it
-    /// is encrypted.
+    /// Returns the first private key of the text; `None` if there is none that can be read, for
+    /// example if it is encrypted.
     pub(crate) fn from_pem(text: &[u8]) -> Option<Self> {
         let mut rest = text;
         loop {
@@ -58,7 +58,7 @@ impl PrivateKey {
     }
 }
 
-/// What is before `mark`, and what is after it.
+/// Returns the text before `mark` and the text after it.
 fn split<'t>(text: &'t [u8], mark: &[u8]) -> Option<(&'t [u8], &'t [u8])> {
     let at = text.windows(mark.len()).position(|window| window == mark)?;
     Some((&text[..at], &text[at + mark.len()..]))

@@ -1,10 +1,10 @@
-//! Tolerance by name.
+//! Deviations of KMEs that are tolerated by name.
 
 use std::str::FromStr;
 
 use crate::Error;
 
-/// Deviations from the specification to tolerate, each by its name. The default is none of them.
+/// Deviations from the specification to tolerate, each by its name. By default there are none.
 ///
 /// | name | tolerates |
 /// | --- | --- |
@@ -29,7 +29,7 @@ use crate::Error;
 pub struct Quirks(u16);
 
 impl Quirks {
-    /// None: the specification to the letter.
+    /// No quirks: the specification to the letter.
     pub const STRICT: Self = Self(0);
     /// key_IDs that are not in UUID form; several vendors number their keys.
     pub const ANY_KEY_ID: Self = Self(1);
@@ -63,7 +63,7 @@ impl Quirks {
         ("any-extension", Self::ANY_EXTENSION),
     ];
 
-    /// Whether all of `other` are tolerated.
+    /// Returns whether all of `other` are tolerated.
     #[must_use]
     pub const fn contains(self, other: Self) -> bool {
         self.0 & other.0 == other.0
@@ -80,7 +80,7 @@ impl std::ops::BitOr for Quirks {
 impl FromStr for Quirks {
     type Err = Error;
 
-    /// Names separated by commas; the empty text is [`Quirks::STRICT`].
+    /// Parses names separated by commas; the empty text is [`Quirks::STRICT`].
     fn from_str(text: &str) -> Result<Self, Error> {
         let mut quirks = Self::STRICT;
         for name in text.split(',').map(str::trim).filter(|n| !n.is_empty()) {

@@ -9,7 +9,7 @@ use crate::exchange::{Call, Prepared};
 use crate::parse::{self, Asked};
 use crate::{Client, Error, KeyContainer, Quirks};
 
-/// A request for fresh keys (clauses 5.3 and 6.2). Sent by [`send`](EncKeys::send).
+/// A request for fresh keys (clauses 5.3 and 6.2). [`send`](EncKeys::send) sends it.
 #[must_use = "nothing is sent before send()"]
 #[derive(Debug)]
 pub struct EncKeys<'c> {
@@ -37,22 +37,22 @@ impl<'c> EncKeys<'c> {
         }
     }
 
-    /// How many keys. Default 1.
+    /// Sets the number of keys. Default 1.
     pub fn number(mut self, keys: u32) -> Self {
         self.number = Some(keys);
         self
     }
 
-    /// Size of each key in bits, a multiple of 8. Default the KME's
-    /// [`key_size`](crate::Status::key_size): where this client has asked for the peer's
-    /// [`status`](Client::status) before, the keys must be of the size it named last, otherwise
-    /// they need only be of one size.
+    /// Sets the size of each key in bits, a multiple of 8. Default the KME's
+    /// [`key_size`](crate::Status::key_size). If this client has asked for the peer's
+    /// [`status`](Client::status) before, the keys must have the size in the last status. Otherwise
+    /// they only have to be of one size.
     pub fn size(mut self, bits: u32) -> Self {
         self.size = Some(bits);
         self
     }
 
-    /// Further slaves that may draw the same keys (multicast).
+    /// Sets further slaves that may draw the same keys (multicast).
     pub fn additional_slave_sae_ids<I>(mut self, saes: I) -> Self
     where
         I: IntoIterator<Item: Into<String>>,
@@ -61,30 +61,30 @@ impl<'c> EncKeys<'c> {
         self
     }
 
-    /// Adds an extension that the KME must support or refuse the request: a JSON object.
+    /// Adds an extension, a JSON object. A KME that does not support it must refuse the request.
     pub fn extension_mandatory(mut self, extension: Value) -> Self {
         self.mandatory.push(extension);
         self
     }
 
-    /// Adds an extension that the KME may ignore: a JSON object.
+    /// Adds an extension, a JSON object, which the KME may ignore.
     pub fn extension_optional(mut self, extension: Value) -> Self {
         self.optional.push(extension);
         self
     }
 
-    /// Sends it as GET, which carries `number` and `size` only.
+    /// Sends the request as GET, which carries only `number` and `size`.
     pub fn via_get(mut self) -> Self {
         self.via_get = true;
         self
     }
 
-    /// Sends the request and checks the answer: exactly as many keys as asked for, each of the
-    /// size asked for, under distinct key_IDs.
+    /// Sends the request and checks the answer: exactly as many keys as requested, each of the
+    /// requested size, with distinct key_IDs.
     ///
     /// # Errors
-    /// See [`Error`]; with [`KeyPossiblyConsumed`](Error::KeyPossiblyConsumed) the KME may have
-    /// spent keys on this call.
+    /// See [`Error`]. After [`KeyPossiblyConsumed`](Error::KeyPossiblyConsumed) the KME may have
+    /// used up keys for this call.
     pub async fn send(self) -> Result<KeyContainer, Error> {
         let number = self.number.unwrap_or(1) as usize;
         let size = self.size.or_else(|| self.client.key_size(&self.slave_sae));
@@ -114,7 +114,7 @@ impl<'c> EncKeys<'c> {
         self.additional_slaves.iter().try_for_each(|sae| check_sae_id(sae))
     }
 
-    /// The size as the KME counts it.
+    /// Returns the size in the unit of the KME.
     fn wire_size(&self) -> Option<u32> {
         let bytes = self.client.limits().quirks.contains(Quirks::SIZE_IN_BYTES);
         self.size.map(|bits| if bytes { bits / 8 } else { bits })
@@ -145,7 +145,7 @@ impl<'c> EncKeys<'c> {
     }
 }
 
-/// Clause 6.2. What was not asked for is absent.
+/// The body of `enc_keys` (clause 6.2). Members that were not set are absent.
 #[derive(Serialize)]
 struct KeyRequest<'r> {
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -160,7 +160,7 @@ struct KeyRequest<'r> {
     extension_optional: &'r [Value],
 }
 
-/// Clause 6.4.
+/// The body of `dec_keys` (clause 6.4).
 #[derive(Serialize)]
 struct KeyIds<'r> {
     #[serde(rename = "key_IDs")]
@@ -177,7 +177,7 @@ struct KeyId<'r> {
     extension: Option<&'r Value>,
 }
 
-/// A request for keys by their key_IDs (clauses 5.4 and 6.4). Sent by [`send`](DecKeys::send).
+/// A request for keys by their key_IDs (clauses 5.4 and 6.4). [`send`](DecKeys::send) sends it.
 #[must_use = "nothing is sent before send()"]
 #[derive(Debug)]
 pub struct DecKeys<'c> {
@@ -215,7 +215,7 @@ impl<'c> DecKeys<'c> {
         self.key_id(id)
     }
 
-    /// The `key_IDs_extension` of the request (clause 6.4): a JSON object.
+    /// Sets the `key_IDs_extension` of the request (clause 6.4): a JSON object.
     pub fn key_ids_extension(mut self, extension: Value) -> Self {
         self.extension = Some(extension);
         self
@@ -230,23 +230,23 @@ impl<'c> DecKeys<'c> {
         self
     }
 
-    /// The size in bits that every key must have. It is not sent; without it the keys need only
-    /// be of one size.
+    /// Sets the size in bits that every key must have. It is not sent. Without it, the keys only
+    /// have to be of one size.
     pub fn size(mut self, bits: u32) -> Self {
         self.size = Some(bits);
         self
     }
 
-    /// Sends it as GET, which carries one key_ID.
+    /// Sends the request as GET, which carries one key_ID.
     pub fn via_get(mut self) -> Self {
         self.via_get = true;
         self
     }
 
-    /// Sends the request and checks the answer: exactly the keys asked for, in their order.
+    /// Sends the request and checks the answer: exactly the requested keys, in their order.
     ///
     /// # Errors
-    /// See [`Error`]; with [`KeyPossiblyConsumed`](Error::KeyPossiblyConsumed) the KME may have
+    /// See [`Error`]. After [`KeyPossiblyConsumed`](Error::KeyPossiblyConsumed) the KME may have
     /// destroyed the keys of this call.
     pub async fn send(self) -> Result<KeyContainer, Error> {
         self.check()?;
@@ -292,7 +292,7 @@ impl<'c> DecKeys<'c> {
             if !parse::is_key_id(id) {
                 return Err(refuse("a key_ID is 1 to 128 visible ASCII characters"));
             }
-            // The answer could not pass either, and the keys would be gone.
+            // The answer could not pass the checks either, and the keys would be consumed.
             if !any {
                 return Err(refuse(&format!(
                     "key_ID {id} is not a UUID (clause 6.4; quirk any-key-id tolerates others)"
@@ -306,7 +306,7 @@ impl<'c> DecKeys<'c> {
     }
 }
 
-/// Refuses a request whose answer would be refused in any case, after its keys were consumed.
+/// Refuses a request whose answer would always be refused, after its keys were consumed.
 fn check_answer(client: &Client, number: usize, size: Option<u32>) -> Result<(), Error> {
     if number > parse::MAX_KEYS {
         let most = parse::MAX_KEYS;

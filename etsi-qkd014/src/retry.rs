@@ -2,19 +2,19 @@
 
 use std::time::Duration;
 
-/// How often a call is repeated by the client itself.
+/// How often the client itself repeats a call.
 ///
-/// A repeat follows only a failure that may pass: unreachable, timed out, cut off, 503. What it
-/// may cost differs by call, so each has its own number:
+/// The client repeats a call only after a temporary failure: unreachable, timed out, cut off, 503.
+/// The cost of a repeat depends on the call, so each has its own number:
 ///
-/// - `status` reads only and may be repeated freely (default 2).
+/// - `status` only reads and may be repeated freely (default 2).
 /// - `dec_keys` that was cut off may have destroyed its keys at the KME; many KMEs give them again
 ///   for a while (default 1).
 /// - `enc_keys` that was cut off may have consumed keys that nobody will use. It is repeated
 ///   (default 0) only after failures in which the request certainly was not served, unless
 ///   [`enc_keys_after_ambiguous_failure`](Self::enc_keys_after_ambiguous_failure) is set.
 ///
-/// Whatever the repeats, [`deadline`](crate::ClientBuilder::deadline) bounds the whole call.
+/// [`deadline`](crate::ClientBuilder::deadline) limits the whole call with its repeats.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RetryPolicy {
     pub(crate) status: u32,
@@ -32,7 +32,7 @@ impl Default for RetryPolicy {
 }
 
 impl RetryPolicy {
-    /// Every call is made once.
+    /// Returns a policy that makes every call once.
     #[must_use]
     pub const fn none() -> Self {
         Self {
@@ -45,37 +45,37 @@ impl RetryPolicy {
         }
     }
 
-    /// Repeats of `status`.
+    /// Sets the repeats of `status`.
     #[must_use]
     pub const fn status(mut self, repeats: u32) -> Self {
         self.status = repeats;
         self
     }
 
-    /// Repeats of `dec_keys`.
+    /// Sets the repeats of `dec_keys`.
     #[must_use]
     pub const fn dec_keys(mut self, repeats: u32) -> Self {
         self.dec_keys = repeats;
         self
     }
 
-    /// Repeats of `enc_keys` after failures in which the request certainly was not served.
+    /// Sets the repeats of `enc_keys` after failures in which the request certainly was not served.
     #[must_use]
     pub const fn enc_keys(mut self, repeats: u32) -> Self {
         self.enc_keys = repeats;
         self
     }
 
-    /// Also repeat `enc_keys` when the failed try may have consumed keys.
+    /// Sets whether `enc_keys` is also repeated when the failed attempt may have consumed keys.
     #[must_use]
     pub const fn enc_keys_after_ambiguous_failure(mut self, repeat: bool) -> Self {
         self.enc_keys_ambiguous = repeat;
         self
     }
 
-    /// The pause before the first repeat, which doubles up to `max`. Each pause is drawn evenly
-    /// from the upper half of its length. Default 100 ms and 2 s. A `Retry-After` of the KME
-    /// counts where it is longer.
+    /// Sets the pause before the first repeat, which doubles up to `max`. Each pause is drawn
+    /// evenly from the upper half of its length. Default 100 ms and 2 s. A `Retry-After` of the KME
+    /// applies if it is longer.
     #[must_use]
     pub const fn pause(mut self, first: Duration, max: Duration) -> Self {
         self.pause = first;
@@ -83,7 +83,7 @@ impl RetryPolicy {
         self
     }
 
-    /// The pause before repeat number `repeat` (from 0), `jitter` drawn from 0..=255.
+    /// Returns the pause before repeat number `repeat` (from 0). `jitter` is a random byte.
     pub(crate) fn pause_before(&self, repeat: u32, jitter: u8) -> Duration {
         let full = self.pause.saturating_mul(1 << repeat.min(16)).min(self.pause_max);
         full / 2 + (full / 2).saturating_mul(jitter.into()) / 255

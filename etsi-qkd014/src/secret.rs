@@ -1,4 +1,4 @@
-//! A byte buffer that never leaves a copy behind: not when it grows, not when it is dropped.
+//! A byte buffer that never leaves a copy behind, neither when it grows nor when it is dropped.
 
 use std::io::{self, Read};
 
@@ -15,13 +15,13 @@ pub(crate) struct SecretBuf {
 pub(crate) struct LimitExceeded;
 
 impl SecretBuf {
-    /// `expected` bytes are allocated at once, which the sender may have lied about: it is taken
-    /// as a hint within the limit.
+    /// Creates a buffer that allocates `expected` bytes at once. The sender may have lied about
+    /// them, so they are only a hint within the limit.
     pub(crate) fn new(expected: usize, limit: usize) -> Self {
         Self { bytes: Vec::with_capacity(expected.min(limit).min(64 << 10)), limit }
     }
 
-    /// All that comes; `None` where that is more than `limit` bytes.
+    /// Reads everything from `source`; `None` if that is more than `limit` bytes.
     pub(crate) fn read_from(mut source: impl Read, limit: usize) -> io::Result<Option<Self>> {
         let mut content = Self::new(0, limit);
         let mut part = Zeroizing::new([0; 4096]);
@@ -36,8 +36,8 @@ impl SecretBuf {
         }
     }
 
-    /// The bytes in a block of their own size: `SecretSlice::from(Vec)` would have the allocator
-    /// shrink the block, which may leave a copy behind.
+    /// Returns the bytes in a block of exactly their size: `SecretSlice::from(Vec)` would have the
+    /// allocator shrink the block, which may leave a copy behind.
     pub(crate) fn into_secret(self) -> SecretSlice<u8> {
         Box::<[u8]>::from(&self.bytes[..]).into()
     }
@@ -66,8 +66,8 @@ impl Drop for SecretBuf {
     }
 }
 
-/// Zeroizes many bytes at once, where `Zeroize` goes byte by byte. The barrier keeps the compiler
-/// from leaving it out.
+/// Zeroizes many bytes at once; `Zeroize` would go byte by byte. The barrier keeps the compiler
+/// from removing it.
 pub(crate) fn wipe(bytes: &mut [u8]) {
     bytes.fill(0);
     zeroize::optimization_barrier(bytes);

@@ -1,9 +1,9 @@
-//! The common name in a certificate's subject, which is how KMEs and SAEs carry their IDs.
+//! The common name in a certificate's subject, which contains the ID of a KME or SAE.
 
 use rustls::pki_types::CertificateDer;
 
-/// The subject's common name; `None` where the certificate cannot be parsed, has no common name,
-/// has more than one, or one in an encoding other than UTF8String or PrintableString.
+/// Returns the subject's common name. Returns `None` if the certificate cannot be parsed, has no
+/// common name or more than one, or one in an encoding other than UTF8String or PrintableString.
 pub(crate) fn common_name(cert: &CertificateDer<'_>) -> Option<String> {
     let cert = webpki::EndEntityCert::try_from(cert).ok()?;
     common_name_in(cert.subject())
@@ -17,7 +17,7 @@ const PRINTABLE_STRING: u8 = 0x13;
 /// id-at-commonName, 2.5.4.3.
 const COMMON_NAME: [u8; 3] = [0x55, 0x04, 0x03];
 
-/// `rdns`: the content of an RDNSequence (RFC 5280, 4.1.2.4).
+/// Returns the common name in `rdns`, the content of an RDNSequence (RFC 5280, 4.1.2.4).
 pub(crate) fn common_name_in(mut rdns: &[u8]) -> Option<String> {
     let mut found = None;
     while !rdns.is_empty() {
@@ -33,7 +33,7 @@ pub(crate) fn common_name_in(mut rdns: &[u8]) -> Option<String> {
             }
             let text = std::str::from_utf8(element(&mut attribute, tag)?).ok()?;
             if found.replace(text.to_owned()).is_some() {
-                // Two names: it is not clear which of the two the certificate names.
+                // With two common names, it is not clear which one the certificate means.
                 return None;
             }
         }

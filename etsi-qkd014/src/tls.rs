@@ -21,7 +21,7 @@ use crate::pem::PrivateKey;
 use crate::subject::common_name;
 use crate::{Error, RefusedBy};
 
-/// X25519MLKEM768 first, the classical groups for KMEs that lack it.
+/// Returns the provider, with X25519MLKEM768 first, and the classical groups for KMEs that lack it.
 pub(crate) fn provider() -> Arc<CryptoProvider> {
     use aws_lc_rs::kx_group::{SECP256R1, SECP384R1, X25519, X25519MLKEM768};
     Arc::new(CryptoProvider {
@@ -30,7 +30,7 @@ pub(crate) fn provider() -> Arc<CryptoProvider> {
     })
 }
 
-/// The KME's ID and whether the host name in the URL counts.
+/// The KME's ID, and whether the host name in the URL is checked.
 #[derive(Clone, Debug)]
 pub(crate) struct Identity {
     pub(crate) kme_id: Option<String>,
@@ -57,7 +57,7 @@ pub(crate) fn client_config(
         .dangerous()
         .with_custom_certificate_verifier(Arc::new(verifier))
         .with_client_cert_resolver(Arc::new(resolver));
-    // Each connection proves both ends anew, and no session secret is kept.
+    // Each connection authenticates both ends again, and no session secret is kept.
     tls.resumption = Resumption::disabled();
     Ok(tls)
 }
@@ -70,7 +70,7 @@ fn is_pem(bytes: &[u8]) -> bool {
     bytes.windows(11).any(|window| window == b"-----BEGIN ")
 }
 
-/// All certificates of a PEM text, or the one of a DER file.
+/// Returns all certificates of a PEM text, or the one of a DER file.
 pub(crate) fn certificates(
     bytes: &[u8],
     setting: &'static str,
@@ -87,7 +87,8 @@ pub(crate) fn certificates(
     Ok(all)
 }
 
-/// A certificate of X.509 version 1: it has no extensions, and so names neither host nor purpose.
+/// The certificate has X.509 version 1 or 2. Such a certificate has no extensions, and so names neither host nor
+/// purpose.
 #[derive(Debug)]
 struct OldVersion;
 
@@ -101,14 +102,14 @@ impl std::fmt::Display for OldVersion {
 
 impl std::error::Error for OldVersion {}
 
-/// Whether this is an X.509 certificate of version 1 or 2.
+/// Returns whether a certificate has X.509 version 1 or 2.
 fn is_of_old_version(certificate: &CertificateDer<'_>) -> bool {
     let parsed = webpki::EndEntityCert::try_from(certificate);
     matches!(parsed, Err(webpki::Error::UnsupportedCertVersion))
 }
 
-/// The old version of a certificate that the chain needs, or the error as it is. A root that a KME sends along
-/// may have any version.
+/// Returns an error about the old version of a certificate that the chain needs, or the given error. A root that a KME
+/// sends along may have any version.
 fn version_or(
     error: rustls::Error,
     end_entity: &CertificateDer<'_>,
@@ -127,7 +128,7 @@ fn certified_key(cert: &[u8], key: &[u8]) -> Result<CertifiedKey, Error> {
     if chain.iter().any(is_of_old_version) {
         return Err(config("sae_cert", format!("no usable certificate: {OldVersion}")));
     }
-    // The parsers' reasons are not passed on: they have seen the key.
+    // The parsers' reasons are not passed on, because the parsers have seen the key.
     let unusable = || {
         let accepted = "accepted: PKCS#8, SEC1 or PKCS#1, as PEM or DER, unencrypted";
         config("sae_key", format!("no usable private key; {accepted}"))
@@ -151,7 +152,7 @@ fn certified_key(cert: &[u8], key: &[u8]) -> Result<CertifiedKey, Error> {
     }
 }
 
-/// webpki's checks against the one CA, and the subject where a KME ID was given.
+/// webpki's checks with the one CA, and a check of the subject if a KME ID was given.
 #[derive(Debug)]
 struct KmeVerifier {
     roots: RootCertStore,
@@ -219,7 +220,7 @@ impl ServerCertVerifier for KmeVerifier {
     }
 }
 
-/// Finds rustls' own error below another library's.
+/// Finds rustls' own error inside another library's error.
 pub(crate) fn tls_error<'e>(
     error: &'e (dyn std::error::Error + 'static),
 ) -> Option<&'e rustls::Error> {
@@ -229,7 +230,7 @@ pub(crate) fn tls_error<'e>(
             return Some(found);
         }
         next = match error.downcast_ref::<std::io::Error>() {
-            // io::Error's `source` skips the error it wraps.
+            // io::Error's `source` skips the wrapped error.
             Some(io) => io.get_ref().map(|e| e as &(dyn std::error::Error + 'static)),
             None => error.source(),
         };
@@ -237,9 +238,9 @@ pub(crate) fn tls_error<'e>(
     None
 }
 
-/// Who refused and why; `None` where the error does not mean that the handshake was refused.
-/// `connected`: the error came after the client's part of the handshake was over. TLS 1.3 servers
-/// refuse a client's certificate only then, with an alert, before they read the request.
+/// Returns which end refused the handshake, and why; `None` if the error does not mean that. `connected` is true if the
+/// error came after the client's part of the handshake was over. Only then do TLS 1.3 servers refuse a client's
+/// certificate, with an alert, before they read the request.
 pub(crate) fn refusal(error: &rustls::Error, connected: bool) -> Option<(RefusedBy, String)> {
     use AlertDescription as Alert;
     match error {
@@ -254,7 +255,7 @@ pub(crate) fn refusal(error: &rustls::Error, connected: bool) -> Option<(Refused
                     | Alert::UnknownCA
                     | Alert::AccessDenied
                     | Alert::CertificateRequired
-                    // Sent in handshakes only: our signature, or our certificate's, does not verify.
+                    // Only sent in handshakes: our signature, or our certificate's, does not verify.
                     | Alert::DecryptError
                     | Alert::HandshakeFailure
             );
@@ -306,7 +307,7 @@ mod tests {
 
     #[test]
     fn hybrid_key_exchange_is_offered_first_and_with_a_share() {
-        // rustls sends a share for the first group.
+        // rustls sends a key share for the first group.
         assert_eq!(provider().kx_groups[0].name(), NamedGroup::X25519MLKEM768);
     }
 

@@ -1,18 +1,17 @@
-//! The value of `key`: a JSON string of base64, decoded without an unzeroized copy.
+//! The value of `key`: a JSON string of base64, which is decoded without a copy that is not zeroized.
 
 use secrecy::{ExposeSecretMut, SecretSlice};
 use zeroize::Zeroizing;
 
-/// Decodes the raw text of a JSON string, quotes included. Strict RFC 4648 base64 with padding;
-/// white space between the characters is allowed, and JSON escapes of base64 characters are
-/// undone, as serializers that escape `/` or `+` write them.
+/// Decodes the raw text of a JSON string with its quotes. Accepts strict RFC 4648 base64 with padding, and white space
+/// between the characters. Undoes JSON escapes of base64 characters, because some serializers escape `/` or `+`.
 pub(super) fn decode(raw: &str) -> Result<SecretSlice<u8>, &'static str> {
     let inner = raw
         .strip_prefix('"')
         .and_then(|rest| rest.strip_suffix('"'))
         .ok_or("is not a string")?
         .as_bytes();
-    // Nearly every KME writes nothing but base64, which is decoded where it lies.
+    // Nearly every KME writes only base64, which is decoded in place.
     decode_text(inner).or_else(|why| {
         if inner.iter().any(|byte| is_space(*byte) || *byte == b'\\') {
             decode_text(&plain(inner)?)
@@ -22,7 +21,7 @@ pub(super) fn decode(raw: &str) -> Result<SecretSlice<u8>, &'static str> {
     })
 }
 
-/// Straight into the only block that will hold the key.
+/// Decodes directly into the only block that will contain the key.
 pub(crate) fn decode_text(text: &[u8]) -> Result<SecretSlice<u8>, &'static str> {
     const REFUSED: &str = "is not base64 with padding (RFC 4648 section 4)";
     let padding = text.iter().rev().take(2).take_while(|byte| **byte == b'=').count();
@@ -44,16 +43,16 @@ pub(crate) fn decode_text(text: &[u8]) -> Result<SecretSlice<u8>, &'static str> 
     if sound { Ok(secret) } else { Err(REFUSED) }
 }
 
-/// Characters that are decoded at a time.
+/// Number of characters that are decoded at a time.
 const PART: usize = 64;
 
-/// What no character stands for.
+/// The value of a byte that is no base64 character.
 const NONE: u8 = 0xff;
 
-/// The six bits of a character. Neither a branch nor a table: a look-up leaves in the cache which
-/// part of the table it touched.
+/// Returns the six bits of a character. Uses neither a branch nor a table: a table look-up shows in the cache which
+/// part of the table it accessed.
 fn value_of(digit: u8) -> u8 {
-    // Adds the distance to the value where the digit is in the range.
+    // Adds the distance to the value if the character is in the range.
     let within = |first: u8, last: u8, value: u8| {
         let is_in = u8::from(digit.wrapping_sub(first) <= last - first);
         is_in.wrapping_neg() & digit.wrapping_sub(first).wrapping_add(value).wrapping_sub(NONE)
@@ -65,8 +64,8 @@ fn value_of(digit: u8) -> u8 {
         .wrapping_add(within(b'/', b'/', 63))
 }
 
-/// Joins four values to three bytes, and the remaining values to one or two. Whether the bits that no byte
-/// takes are zero.
+/// Joins each four values to three bytes, and the remaining values to one or two. Returns whether the unused bits are
+/// zero.
 fn join(values: &[u8], bytes: &mut [u8]) -> bool {
     let (fours, rest) = values.as_chunks::<4>();
     let (threes, last) = bytes.as_chunks_mut::<3>();
@@ -86,7 +85,7 @@ fn join(values: &[u8], bytes: &mut [u8]) -> bool {
     }
 }
 
-/// The text without white space and escapes.
+/// Returns the text without white space and escapes.
 fn plain(inner: &[u8]) -> Result<Zeroizing<Vec<u8>>, &'static str> {
     let mut text = Zeroizing::new(Vec::with_capacity(inner.len()));
     let mut at = 0;
@@ -107,7 +106,7 @@ fn is_space(byte: u8) -> bool {
     matches!(byte, b' ' | b'\t' | b'\r' | b'\n')
 }
 
-/// One JSON escape at the start of `text`: its byte, and how long the escape is.
+/// Decodes one JSON escape at the start of `text`. Returns its byte, and the length of the escape.
 fn unescape(text: &[u8]) -> Option<(u8, usize)> {
     match text.get(1)? {
         b'/' => Some((b'/', 2)),

@@ -1,4 +1,4 @@
-//! Key container (clause 6.3), and the checks of its promises.
+//! The key container (clause 6.3), and the checks of its promises.
 
 use std::cmp::Ordering;
 
@@ -10,28 +10,29 @@ use crate::{Error, Key, KeyContainer, Quirks};
 
 /// Most keys in one answer.
 pub(crate) const MAX_KEYS: usize = 16_384;
-/// Longest key_ID, bytes.
+/// Longest key_ID in bytes.
 const MAX_KEY_ID: usize = 128;
 
-/// What the request asked for, to hold the answer against.
+/// The request, with which the answer is compared.
 pub(crate) enum Asked<'a> {
-    /// `enc_keys`: so many keys.
+    /// `enc_keys`: this number of keys.
     Number(usize),
-    /// `dec_keys`: the keys with these IDs, which differ in more than letter case.
+    /// `dec_keys`: the keys with these IDs, which differ not only in letter case.
     Ids(&'a [String]),
 }
 
-/// The least bytes of an answer with so many keys of so many bits, where an ID has one character.
+/// Returns the minimum length of an answer with `number` keys of `size` bits, if each ID has one
+/// character.
 pub(crate) fn least_length(number: usize, size: Option<u32>) -> u64 {
     const AROUND: u64 = r#"{"keys":[]}"#.len() as u64;
     const EACH: u64 = r#"{"key_ID":"x","key":""},"#.len() as u64;
     let key = (u64::from(size.unwrap_or(8)) / 8).div_ceil(3) * 4;
-    // No comma after the last.
+    // There is no comma after the last key.
     AROUND + (number as u64).saturating_mul(EACH + key).saturating_sub(1)
 }
 
-/// Reads a key container and checks it against what was asked. `size`: bits of every key, where
-/// the request (or the caller) named it; otherwise the keys need only be of one size.
+/// Reads a key container and compares it with the request. `size` is the size of every key in bits,
+/// if the request or the caller named it; otherwise the keys only have to be of one size.
 pub(crate) fn key_container(
     body: &[u8],
     asked: &Asked<'_>,
@@ -100,14 +101,14 @@ fn check_key_id(id: &str, place: ObjectPlace, quirks: Quirks) -> Result<(), Erro
     ))
 }
 
-/// Whether it may be a key_ID at all, also with [`Quirks::ANY_KEY_ID`].
+/// Returns whether an ID can be a key_ID at all, also with [`Quirks::ANY_KEY_ID`].
 pub(crate) fn is_key_id(id: &str) -> bool {
     (1..=MAX_KEY_ID).contains(&id.len()) && id.bytes().all(|c| c.is_ascii_graphic())
 }
 
 pub(crate) fn is_uuid(id: &str) -> bool {
     let Ok(id) = <&[u8; 36]>::try_from(id.as_bytes()) else { return false };
-    // Without a way out before the end, so that many characters are looked at at once.
+    // Without an early exit, so that many characters are checked at a time.
     let fits = |(at, c): (usize, &u8)| {
         let dash = matches!(at, 8 | 13 | 18 | 23);
         (dash & (*c == b'-')) | (!dash & c.is_ascii_hexdigit())
@@ -115,15 +116,15 @@ pub(crate) fn is_uuid(id: &str) -> bool {
     id.iter().enumerate().map(fits).fold(true, |all, fits| all & fits)
 }
 
-/// The order of key_IDs, in which letter case does not count.
+/// Compares key_IDs without regard to letter case.
 fn by_id(one: &str, other: &str) -> Ordering {
     let lower = |c: u8| c.to_ascii_lowercase();
     one.bytes().map(lower).cmp(other.bytes().map(lower))
 }
 
-/// A key_ID that is there twice, in any letter case.
+/// Returns a key_ID that occurs twice, in any letter case.
 pub(crate) fn repeated<'i>(ids: impl Iterator<Item = &'i str> + Clone) -> Option<&'i str> {
-    // Nearly always they differ in their first bytes already.
+    // Nearly always the first bytes already differ.
     let mut starts: Vec<u64> = ids.clone().map(start).collect();
     starts.sort_unstable();
     if starts.windows(2).all(|pair| pair[0] != pair[1]) {
@@ -134,7 +135,7 @@ pub(crate) fn repeated<'i>(ids: impl Iterator<Item = &'i str> + Clone) -> Option
     ids.windows(2).find(|pair| is_same(pair[0], pair[1])).map(|pair| pair[0])
 }
 
-/// The first eight bytes, without letter case.
+/// Returns the first eight bytes, in lower case.
 fn start(id: &str) -> u64 {
     let mut start = [0; 8];
     let length = id.len().min(8);
@@ -168,8 +169,8 @@ fn check_sizes(keys: &[Key], size: Option<u32>) -> Result<(), Error> {
     }
 }
 
-/// A KME may answer in another order and in another letter case: the caller's bytes count. There
-/// are as many keys as IDs.
+/// Puts the keys in the order of the request, and replaces their key_IDs by the caller's: a KME may
+/// answer in another order and in another letter case. There must be as many keys as IDs.
 fn put_in_order(keys: &mut Vec<Key>, ids: &[String]) -> Result<(), Error> {
     let pairs = |keys: &[Key]| keys.iter().zip(ids).all(|(key, id)| is_same(key.key_id(), id));
     if !pairs(keys) {

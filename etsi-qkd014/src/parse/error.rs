@@ -1,5 +1,5 @@
-//! Error (clause 6.5). The most lenient parser here: whatever the body is, the status code has
-//! already said what happened.
+//! The error (clause 6.5). This is the most lenient parser: the status code alone has already told
+//! the result, whatever the body contains.
 
 use serde::de::DeserializeOwned;
 use serde_json::Value;
@@ -7,9 +7,9 @@ use serde_json::Value;
 use super::json::{self, Object};
 use crate::Quirks;
 
-/// Longest message passed on, bytes.
+/// Longest message that is passed on, in bytes.
 const MAX_MESSAGE: usize = 512;
-/// Most details passed on.
+/// Most details that are passed on.
 const MAX_DETAILS: usize = 64;
 
 #[derive(Debug, Default)]
@@ -18,8 +18,8 @@ pub(crate) struct ErrorAnswer {
     pub(crate) details: Vec<Value>,
 }
 
-/// Only the two members that the specification lists are taken out of the text. The others, among
-/// which a confused KME may have put keys, are not copied.
+/// Reads only the two members that the specification lists. Other members are not copied, because a
+/// faulty KME may have put keys there.
 pub(crate) fn error_answer(body: &[u8]) -> ErrorAnswer {
     let object = json::text(body).and_then(|text| Object::parse(text, Quirks::NULL_MEMBERS));
     let Ok(mut object) = object else { return ErrorAnswer::default() };
@@ -34,8 +34,8 @@ fn member<T: DeserializeOwned>(object: &mut Object<'_>, name: &str) -> Option<T>
     json::is_shallow(raw).then(|| serde_json::from_str(raw).ok())?
 }
 
-/// The message goes to logs and terminals: bounded, and without characters that move the cursor,
-/// begin a line or turn the direction of writing.
+/// Makes a message safe for logs and terminals: limits its length, and removes characters that move
+/// the cursor, begin a line or change the direction of writing.
 fn printable(message: &str) -> String {
     let mut out = String::new();
     for c in message.chars() {
@@ -49,7 +49,8 @@ fn printable(message: &str) -> String {
 }
 
 fn is_layout(c: char) -> bool {
-    // The standard library keeps the table of what is printable, and escapes quotes besides.
+    // The standard library knows which characters are printable; it also escapes quotes, which are
+    // kept here.
     !matches!(c, '"' | '\'' | '\\') && c.escape_debug().len() > 1
 }
 

@@ -12,19 +12,19 @@ use serde_json::value::RawValue;
 use super::malformed;
 use crate::{Error, Quirks};
 
-/// Deeper nesting than any answer of the specification needs in an extension.
+/// Maximum nesting; no extension of the specification needs more.
 const MAX_DEPTH: usize = 32;
-/// Members of one object; the largest of the specification has 12.
+/// Most members of one object; the largest object of the specification has 12.
 const MAX_MEMBERS: usize = 64;
-/// Longest text member, bytes.
+/// Longest text member in bytes.
 const MAX_TEXT: usize = 4096;
 
-/// An answer as text.
+/// Returns an answer as text.
 pub(super) fn text(body: &[u8]) -> Result<&str, Error> {
     std::str::from_utf8(body).map_err(|_| malformed("body", "is not UTF-8"))
 }
 
-/// Which object is read: put into words only where there is an error to tell.
+/// The object that is read. It is formatted only for errors.
 #[derive(Clone, Copy)]
 pub(super) enum ObjectPlace {
     /// The answer itself.
@@ -44,11 +44,11 @@ impl fmt::Display for ObjectPlace {
 
 type Member<'a> = (Cow<'a, str>, &'a RawValue);
 
-/// What is done with each object of `keys`.
+/// The function that handles each object of `keys`.
 pub(super) type Each<'f, 'a> = dyn FnMut(ObjectPlace, &mut Object<'a>) -> Result<(), Error> + 'f;
 
-/// One JSON object. Members are taken out by name; [`finish`](Object::finish) complains of what
-/// is left.
+/// One JSON object. Members are taken out by name; [`finish`](Object::finish) reports the remaining
+/// ones.
 pub(super) struct Object<'a> {
     at: ObjectPlace,
     members: Vec<Member<'a>>,
@@ -56,14 +56,14 @@ pub(super) struct Object<'a> {
 }
 
 impl<'a> Object<'a> {
-    /// The object that is all of `text`.
+    /// Parses `text`, which must be one object.
     pub(super) fn parse(text: &'a str, quirks: Quirks) -> Result<Self, Error> {
         Self::read(text, quirks, None)
     }
 
-    /// The object that is all of `text`, but for its member `keys`, whose objects are handed to
-    /// `each` as they come: all but those after the first `wanted`. Says how many there are; of
-    /// more than `max` nothing is said.
+    /// Parses `text`, which must be one object. Passes each of the first `wanted` objects of its
+    /// member `keys` to `each`. Also returns the number of all objects in `keys`; more than `max`
+    /// is an error.
     pub(super) fn parse_keys(
         text: &'a str,
         (wanted, max): (usize, usize),
@@ -103,10 +103,10 @@ impl<'a> Object<'a> {
         Ok(object)
     }
 
-    /// How errors call the member `name`.
+    /// Returns the name of the member `name` for errors.
     pub(super) fn path(&self, name: &str) -> String {
-        // A name that a KME made up is shown only where it looks like one, so that nothing else
-        // (a key in the wrong place) gets into an error.
+        // A name that a KME made up is shown only if it looks like a name, so that nothing else
+        // (for example a misplaced key) gets into an error.
         let plain = |c: u8| c.is_ascii_alphanumeric() || c == b'_';
         let shown = if name.len() <= 40 && name.bytes().all(plain) { name } else { "(a member)" };
         match self.at {
@@ -119,7 +119,7 @@ impl<'a> Object<'a> {
         is_same(one, other, self.quirks)
     }
 
-    /// The raw text of a member that may be absent.
+    /// Takes the raw text of an optional member.
     pub(super) fn take(&mut self, name: &str) -> Result<Option<&'a str>, Error> {
         let found = self.members.iter().position(|(known, _)| self.same(known, name));
         let Some(position) = found else { return Ok(None) };
@@ -133,12 +133,12 @@ impl<'a> Object<'a> {
         Ok(Some(value.get()))
     }
 
-    /// The raw text of a member that must be there.
+    /// Takes the raw text of a required member.
     pub(super) fn need(&mut self, name: &str) -> Result<&'a str, Error> {
         self.take(name)?.ok_or_else(|| malformed(self.path(name), "is missing"))
     }
 
-    /// A text member that holds no secret.
+    /// Takes a text member that contains no secret.
     pub(super) fn need_string(&mut self, name: &str) -> Result<String, Error> {
         let raw = self.need(name)?;
         if raw.len() > MAX_TEXT {
@@ -146,14 +146,14 @@ impl<'a> Object<'a> {
         }
         let plain = raw.strip_prefix('"').and_then(|rest| rest.strip_suffix('"'));
         match plain {
-            // JSON that was read as such before, and has no escapes: it says what it is.
+            // A string without escapes that was read as JSON before is used as it is.
             Some(plain) if !plain.contains('\\') => Ok(plain.to_owned()),
             _ => serde_json::from_str(raw)
                 .map_err(|e| malformed(self.path(name), why(&e, "a string"))),
         }
     }
 
-    /// A count that may be absent.
+    /// Takes an optional count.
     pub(super) fn take_count(&mut self, name: &str) -> Result<Option<u64>, Error> {
         let Some(raw) = self.take(name)? else { return Ok(None) };
         serde_json::from_str(raw)
@@ -161,7 +161,7 @@ impl<'a> Object<'a> {
             .map_err(|e| malformed(self.path(name), why(&e, "a whole number from 0")))
     }
 
-    /// An object whose members a vendor defines.
+    /// Takes an object whose members a vendor defines.
     pub(super) fn take_extension(&mut self, name: &str) -> Result<Option<Value>, Error> {
         let Some(raw) = self.take(name)? else { return Ok(None) };
         if !raw.starts_with('{') && !self.quirks.contains(Quirks::ANY_EXTENSION) {
@@ -175,7 +175,7 @@ impl<'a> Object<'a> {
         serde_json::from_str(raw).map(Some).map_err(|e| malformed(self.path(name), why(&e, "JSON")))
     }
 
-    /// Nothing else may be in the object.
+    /// Checks that the object has no other members.
     pub(super) fn finish(&self) -> Result<(), Error> {
         match self.members.first() {
             Some((name, _)) if !self.quirks.contains(Quirks::EXTRA_MEMBERS) => Err(malformed(
@@ -187,7 +187,7 @@ impl<'a> Object<'a> {
     }
 }
 
-/// Whether a value may be made into a [`Value`], for which serde_json goes into the depth.
+/// Returns whether a value can be made into a [`Value`], for which serde_json recurses.
 pub(super) fn is_shallow(raw: &str) -> bool {
     let mut depth = 0_usize;
     let mut bytes = raw.bytes();
@@ -215,7 +215,8 @@ fn skip_string(bytes: &mut std::str::Bytes<'_>) {
     }
 }
 
-/// serde_json's own words quote the text, which may be a key: only the kind and place are told.
+/// Describes an error without serde_json's text, which quotes the input and thus perhaps a key:
+/// only its kind and place.
 fn why(error: &serde_json::Error, expected: &str) -> String {
     let place = format!("line {} column {}", error.line(), error.column());
     match error.classify() {
@@ -232,7 +233,7 @@ fn is_same(one: &str, other: &str, quirks: Quirks) -> bool {
 /// Reads the members of an object.
 struct Members<'m, 'f, 'a> {
     found: &'m mut Vec<Member<'a>>,
-    /// Where the object is the answer, what is to be done with its `keys`.
+    /// Set if the object is the answer: the handling of its `keys`.
     keys: Option<&'m mut Keys<'f, 'a>>,
 }
 
@@ -267,7 +268,7 @@ impl<'a> Visitor<'a> for Members<'_, '_, 'a> {
     }
 }
 
-/// Reads a member's name, which is copied only where it has escapes.
+/// Reads a member's name, which is copied only if it has escapes.
 struct Name;
 
 impl<'a> DeserializeSeed<'a> for Name {
@@ -311,7 +312,7 @@ enum KeysState {
 }
 
 impl Keys<'_, '_> {
-    /// Ends the reading; what serde_json makes of it is not looked at.
+    /// Ends the reading. The error that serde_json makes of it is not used.
     fn fail<E: serde::de::Error>(&mut self, failure: Error) -> E {
         self.state = KeysState::Failed(failure);
         E::custom("see the failure")
@@ -339,7 +340,7 @@ impl<'a> Visitor<'a> for &mut Keys<'_, 'a> {
 
     fn visit_seq<A: SeqAccess<'a>>(self, mut seq: A) -> Result<(), A::Error> {
         let mut count = 0;
-        // One block for the members of all objects, one after the other.
+        // One block for the members of all objects in turn.
         let mut members = Vec::new();
         while count < self.wanted {
             let next = Members { found: &mut members, keys: None };

@@ -1,8 +1,8 @@
-//! Parsers of what a KME answers: bounded, without panic, and without a copy of a key outside
+//! Parsers of a KME's answers. They are bounded, do not panic, and make no copy of a key outside
 //! zeroized memory.
 //!
-//! serde_json only cuts the text into members ([`json`]); the value of `key` is never made into a
-//! `String` by it but decoded from the raw text into zeroized bytes ([`base64`]).
+//! serde_json only splits the text into members ([`json`]). It never makes the value of `key` into
+//! a `String`: that value is decoded from the raw text into zeroized bytes ([`base64`]).
 
 mod base64;
 mod container;

@@ -1,10 +1,10 @@
-//! Status (clause 6.1).
+//! The status (clause 6.1).
 
 use super::json::{Object, text};
 use super::malformed;
 use crate::{Error, Quirks, Status};
 
-/// Largest key size taken seriously, bits.
+/// Largest key size that is accepted, in bits.
 const MAX_SIZE: u64 = 1 << 30;
 
 pub(crate) fn status(body: &[u8], slave_sae: &str, quirks: Quirks) -> Result<Status, Error> {
@@ -45,7 +45,7 @@ fn number(object: &mut Object<'_>, name: &str, quirks: Quirks) -> Result<u64, Er
     }
 }
 
-/// A size in bits, whatever the KME counts in.
+/// Returns a size in bits, whatever unit the KME uses.
 fn size(object: &mut Object<'_>, name: &str, quirks: Quirks) -> Result<u32, Error> {
     let unit = if quirks.contains(Quirks::SIZE_IN_BYTES) { 8 } else { 1 };
     number(object, name, quirks)?

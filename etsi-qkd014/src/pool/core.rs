@@ -1,5 +1,4 @@
-//! When to ask a KME for keys, and for how many: the rules of a pool without I/O and without a
-//! clock.
+//! The rules of a pool, without I/O and without a clock: when to ask a KME for keys, and for how many.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -13,7 +12,7 @@ mod tests;
 
 pub use status::{PoolStatus, Stock};
 
-/// Time between two looks at the KME's stock.
+/// Time between two status calls.
 const STATUS_EVERY: Duration = Duration::from_secs(5);
 /// First and longest pause after a failure that cost no key.
 const RETRY_PAUSE: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(2));
@@ -24,25 +23,23 @@ const RETRY_AFTER_MAX: Duration = Duration::from_secs(60);
 
 /// The rules of a pool of keys for one peer, over any kind of key `K`.
 ///
-/// It does no I/O, has no clock and no randomness of its own: the owner tells it what happens and
-/// when (`now`, time since any fixed moment, never going back), does what [`poll`](Self::poll)
-/// asks for, and reports how that ended. [`KeyPool`](super::KeyPool) is such an owner.
+/// It has no I/O, clock or randomness of its own. The owner reports events with their time (`now`, the time since any
+/// fixed moment, which never decreases), makes the calls that [`poll`](Self::poll) returns, and reports their results.
+/// [`KeyPool`](super::KeyPool) is such an owner.
 ///
-/// - No more keys are held and asked for together than the target, and no more than a quarter of
-///   the KME's `stored_key_count`, but always one. A count of 0 says nothing: some KMEs always
-///   say 0. Keys that the owner took and keeps ready count with them where it says so
-///   ([`set_elsewhere`](Self::set_elsewhere)).
-/// - A call asks for at most [`batch`](Settings::batch) keys and at most the KME's
-///   `max_key_per_request`; 0 says nothing. Until a status was answered, for one.
-/// - A refill begins when a batch, or a quarter of the target, is missing, and goes on until
-///   everything missing is asked for.
-/// - A call that takes longer than [`overdue`](Settings::overdue) is not waited for: its keys are
-///   asked for anew, and taken as well should they come.
-/// - An empty store halves the batch, since fewer keys may be had; a call that succeeds doubles it
-///   again.
-/// - After failures it waits: 100 ms to 2 s where they cost nothing, 1 s to 30 s where each may have
-///   cost keys. Waits double, and are drawn from the upper half of their length. Longer where the KME
-///   says so ([`retry_after`](Self::retry_after)).
+/// - The number of keys that are held or requested is at most the target, and at most a quarter of the KME's
+///   `stored_key_count`, but at least one. A count of 0 is ignored, because some KMEs always report 0. Keys that the
+///   owner took and keeps ready count if it reports them ([`set_elsewhere`](Self::set_elsewhere)).
+/// - A call asks for at most [`batch`](Settings::batch) keys and at most the KME's `max_key_per_request`; 0 is ignored.
+///   Before a status was answered, a call asks for one key.
+/// - A refill begins when a batch, or a quarter of the target, is missing. It goes on until all missing keys are
+///   requested.
+/// - The pool does not wait for a call that takes longer than [`overdue`](Settings::overdue): its keys are requested
+///   again, and accepted as well if they come.
+/// - An empty store halves the batch, because fewer keys may be available. A successful call doubles it again.
+/// - After failures the pool waits: 100 ms to 2 s if they cost nothing, 1 s to 30 s if each may have cost keys. The
+///   waits double, and are drawn from the upper half of their length. They are longer if the KME asks for that
+///   ([`retry_after`](Self::retry_after)).
 ///
 /// ```
 /// use std::time::Duration;
@@ -61,24 +58,24 @@ const RETRY_AFTER_MAX: Duration = Duration::from_secs(60);
 pub struct Core<K> {
     settings: Settings,
     jitter: Box<dyn FnMut() -> u8 + Send>,
-    /// With the time at which each was asked for; the oldest first.
+    /// The keys with the time at which each was requested, the oldest first.
     held: VecDeque<(Duration, K)>,
     in_flight: Vec<Call>,
-    /// Keys that the owner keeps ready.
+    /// The number of keys that the owner keeps ready.
     elsewhere: usize,
-    /// Keys that the next call may ask for.
+    /// The number of keys that the next call may ask for.
     size: u32,
-    /// A refill has begun, and goes on until everything missing is asked for.
+    /// True during a refill, which goes on until all missing keys are requested.
     refilling: bool,
-    /// Failures since the last call that gave keys.
+    /// The number of failures since the last call that gave keys.
     failures: u32,
     not_before: Duration,
-    /// When the last call failed: those that were in flight then fail for the same cause.
+    /// When the last call failed. Calls that were in flight then fail for the same cause.
     failed_at: Option<Duration>,
     held_until: Duration,
-    /// Since when keys were wanted without an answer, for the supply's rate.
+    /// Since when keys have been wanted without an answer; for the supply's rate.
     unanswered_since: Option<Duration>,
-    /// Since when keys were wanted and none came.
+    /// Since when keys have been wanted and none came.
     dry_since: Option<Duration>,
     stock: Stocktaking,
     supply: Supply,
@@ -89,7 +86,7 @@ pub struct Core<K> {
 struct Call {
     keys: u32,
     since: Duration,
-    /// It takes so long that its keys are not counted on any more.
+    /// True if the call takes so long that the pool no longer counts on its keys.
     overdue: bool,
 }
 
@@ -97,7 +94,7 @@ struct Call {
 struct Stocktaking {
     due: Duration,
     asked: bool,
-    /// A status call has ended, well or not.
+    /// True if a status call has ended, with success or without.
     ended: bool,
     last: Option<Stock>,
 }
@@ -111,21 +108,20 @@ struct Counts {
     unusable: u64,
 }
 
-/// Settings of a [`Core`].
+/// The settings of a [`Core`].
 #[derive(Clone, Debug)]
 #[non_exhaustive]
 pub struct Settings {
-    /// Keys to hold. Default 16.
+    /// Number of keys to hold. Default 16.
     pub target: usize,
-    /// Most keys that one call asks for, and so most that a call that is cut off can lose; 0 is
-    /// read as 1. Default 8.
+    /// Most keys that one call asks for, and so most that a call can lose if it is cut off. 0 means 1. Default 8.
     pub batch: u32,
-    /// Most calls for keys at a time; 0 is read as 1. Default 4.
+    /// Most calls for keys at a time. 0 means 1. Default 4.
     pub calls: usize,
-    /// Age, counted from when it was asked for, at which a key is dropped. Default ten minutes.
+    /// Age at which a key is dropped, counted from its request. Default ten minutes.
     pub max_age: Duration,
-    /// Time after which the keys of a call in flight are not counted on any more, so that others
-    /// are asked for in their place, within [`calls`](Self::calls). Default one second.
+    /// Time after which the pool no longer counts on the keys of a call in flight, so that it requests others in their
+    /// place, within [`calls`](Self::calls). Default one second.
     pub overdue: Duration,
 }
 
@@ -136,30 +132,29 @@ impl Default for Settings {
     }
 }
 
-/// A call that the owner of a [`Core`] is to make.
+/// A call that the owner of a [`Core`] has to make.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Ask {
     /// `status`. Ends with [`Core::on_stock`] or [`Core::on_failure`].
     Status,
-    /// `enc_keys` for so many keys, made once. Ends with [`Core::on_keys`] or
-    /// [`Core::on_failure`].
+    /// `enc_keys` for this number of keys, without repeats. Ends with [`Core::on_keys`] or [`Core::on_failure`].
     Keys(u32),
 }
 
-/// What a failed call cost.
+/// The cost of a failed call.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FailureClass {
-    /// The KME did not serve it: unreachable, or it does not accept this SAE. Costs nothing.
+    /// The KME did not serve it: it is unreachable, or does not accept this SAE. Costs nothing.
     Unserved,
-    /// The KME answered and gave nothing, as from an empty store. Costs nothing; a smaller number
-    /// may be had.
+    /// The KME answered but gave no keys, for example because its store is empty. Costs nothing; fewer keys may be
+    /// available.
     Refused,
-    /// Cut off or unusable: its keys may be consumed.
+    /// The answer was cut off or unusable: its keys may be consumed.
     KeysLost,
 }
 
 impl<K> Core<K> {
-    /// An empty pool. `jitter` gives a random byte for each pause.
+    /// Creates an empty pool. `jitter` returns a random byte for each pause.
     pub fn new(settings: Settings, jitter: impl FnMut() -> u8 + Send + 'static) -> Self {
         let settings =
             Settings { batch: settings.batch.max(1), calls: settings.calls.max(1), ..settings };
@@ -183,8 +178,8 @@ impl<K> Core<K> {
         }
     }
 
-    /// The next call to make now, if any. To be repeated until it gives none, after every other
-    /// event and at [`poll_timeout`](Self::poll_timeout).
+    /// Returns the next call to make now, if any. Repeat this until it returns `None`, after every other event and at
+    /// [`poll_timeout`](Self::poll_timeout).
     pub fn poll(&mut self, now: Duration) -> Option<Ask> {
         self.expire(now);
         for call in &mut self.in_flight {
@@ -213,7 +208,7 @@ impl<K> Core<K> {
         Some(Ask::Keys(number))
     }
 
-    /// When [`poll`](Self::poll) may give something, or keys expire, without another event.
+    /// Returns when [`poll`](Self::poll) may return a call, or keys expire, without another event.
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Duration> {
         let status = (!self.stock.asked).then_some(self.stock.due);
@@ -226,14 +221,14 @@ impl<K> Core<K> {
         [status, refill, expiry, overdue].into_iter().flatten().min()
     }
 
-    /// Whether [`poll`](Self::poll) would give a call for keys: for an owner whose calls are made
-    /// elsewhere, and who wakes that place only when it has something to do.
+    /// Returns whether [`poll`](Self::poll) would return a call for keys. For an owner that makes its calls on another
+    /// thread or task, and wakes it only when there is something to do.
     #[must_use]
     pub fn wants_keys(&self, now: Duration) -> bool {
         self.refill_is_due() && self.may_call() && now >= self.begins()
     }
 
-    /// A call for `asked` keys gave `keys`, those that are usable. None at all counts as
+    /// Handles the answer to a call for `asked` keys. `keys` are the usable ones; none at all counts as
     /// [`FailureClass::KeysLost`].
     pub fn on_keys(&mut self, now: Duration, asked: u32, keys: impl IntoIterator<Item = K>) {
         let since = self.ended(asked).unwrap_or(now);
@@ -259,7 +254,7 @@ impl<K> Core<K> {
         self.size = self.size.saturating_mul(2).min(self.settings.batch);
     }
 
-    /// A call failed.
+    /// Handles a failed call.
     pub fn on_failure(&mut self, now: Duration, ask: Ask, class: FailureClass) {
         match ask {
             Ask::Status => self.status_ended(now),
@@ -275,14 +270,14 @@ impl<K> Core<K> {
         }
     }
 
-    /// A status call was answered.
+    /// Handles the answer to a status call.
     pub fn on_stock(&mut self, now: Duration, stock: Stock) {
         self.status_ended(now);
         self.stock.last = Some(stock);
         self.supply.stocked(now, stock);
     }
 
-    /// Hands out the oldest key. Each comes out once, and none past its age.
+    /// Takes the oldest key. Each key is returned once, and none that is too old.
     pub fn take(&mut self, now: Duration) -> Option<K> {
         self.expire(now);
         let (_, key) = self.held.pop_front()?;
@@ -290,27 +285,25 @@ impl<K> Core<K> {
         Some(key)
     }
 
-    /// Puts a key in: one that was taken and then not used, or one that came another way. It is of
-    /// an age with keys asked for at `since`. No target holds it back, so the owner bounds how many
-    /// there are.
+    /// Adds a key: one that was taken and not used, or one from another source. It has the age of keys requested at
+    /// `since`. The target does not limit it, so the owner has to limit their number.
     pub fn put(&mut self, since: Duration, key: K) {
         let at = self.place(since);
         self.held.insert(at, (since, key));
         self.counts.put += 1;
     }
 
-    /// How many keys to hold from now on. Keys beyond it stay until they are taken or too old.
+    /// Sets how many keys to hold from now on. Keys beyond it stay until they are taken or too old.
     pub fn set_target(&mut self, keys: usize) {
         self.settings.target = keys;
     }
 
-    /// How many keys the owner took and keeps ready: they count towards the target as if they were
-    /// held here.
+    /// Sets how many keys the owner took and keeps ready. They count towards the target as if they were held here.
     pub fn set_elsewhere(&mut self, keys: usize) {
         self.elsewhere = keys;
     }
 
-    /// Keys that should be held or asked for: what was set, within the KME's stock.
+    /// Returns how many keys should be held or requested: the target that was set, within the KME's stock.
     #[must_use]
     pub fn target(&self) -> usize {
         match self.stock.last {
@@ -322,18 +315,18 @@ impl<K> Core<K> {
         }
     }
 
-    /// The KME asks for a pause (see [`Error::Unavailable`](crate::Error::Unavailable)): no call for keys meanwhile, for a minute
-    /// at most.
+    /// Handles the KME's request for a pause (see [`Error::Unavailable`](crate::Error::Unavailable)): makes no call for
+    /// keys meanwhile, for at most a minute.
     pub fn retry_after(&mut self, now: Duration, asked: Duration) {
         self.hold_until(now.saturating_add(asked.min(RETRY_AFTER_MAX)));
     }
 
-    /// Asks for no keys before `at`.
+    /// Makes no call for keys before `at`.
     pub fn hold_until(&mut self, at: Duration) {
         self.held_until = self.held_until.max(at);
     }
 
-    /// Drops keys that are too old, and says how many.
+    /// Drops keys that are too old, and returns their number.
     pub fn expire(&mut self, now: Duration) -> usize {
         let old = |at: &Duration| now.saturating_sub(*at) >= self.settings.max_age;
         let mut dropped = 0;
@@ -350,7 +343,7 @@ impl<K> Core<K> {
         self.held.clear();
     }
 
-    /// How it stands.
+    /// Returns the state of the pool.
     #[must_use]
     pub fn status(&self, now: Duration) -> PoolStatus {
         let fresh = |(at, _): &&(Duration, K)| now.saturating_sub(*at) < self.settings.max_age;
@@ -372,7 +365,7 @@ impl<K> Core<K> {
         }
     }
 
-    /// Keys asked for that are counted on.
+    /// Returns the number of requested keys that the pool counts on.
     fn asked(&self) -> usize {
         let in_time = self.in_flight.iter().filter(|call| !call.overdue);
         in_time.map(|call| call.keys as usize).sum()
@@ -388,7 +381,7 @@ impl<K> Core<K> {
         self.target().saturating_sub(here.saturating_add(self.elsewhere))
     }
 
-    /// Where a key asked for at `since` goes, so that the oldest stays first.
+    /// Returns the index for a key requested at `since`, so that the oldest key stays first.
     fn place(&self, since: Duration) -> usize {
         self.held.iter().rposition(|(held, _)| *held <= since).map_or(0, |i| i + 1)
     }
@@ -416,7 +409,7 @@ impl<K> Core<K> {
         self.not_before.max(self.held_until)
     }
 
-    /// Ends a call for keys, and says when it began.
+    /// Ends a call for keys, and returns when it began.
     fn ended(&mut self, asked: u32) -> Option<Duration> {
         let call = self.in_flight.iter().position(|call| call.keys == asked)?;
         Some(self.in_flight.remove(call).since)
@@ -433,8 +426,8 @@ impl<K> Core<K> {
         self.supply.answered(waited, came);
     }
 
-    /// A call that began at `since` failed. Calls that hang together fail together, and are one
-    /// cause to wait longer.
+    /// Handles the failure of a call that began at `since`. Calls that were in flight together fail together; they
+    /// count as one reason to wait longer.
     fn back_off(&mut self, now: Duration, since: Duration, class: FailureClass) {
         if self.failed_at.is_some_and(|at| since < at) {
             return;
@@ -450,7 +443,7 @@ impl<K> Core<K> {
 }
 
 impl<K> fmt::Debug for Core<K> {
-    /// Counts only: `K` is a secret.
+    /// Shows only counts, because `K` is a secret.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Core")
             .field("settings", &self.settings)

@@ -1,9 +1,9 @@
-//! A pool of keys for one peer, drawn ahead of their use.
+//! A pool of keys for one peer, drawn before they are needed.
 //!
-//! - [`KeyPool`] keeps keys ahead and hands each out once; it needs a tokio runtime.
+//! - [`KeyPool`] draws keys in advance and hands each out once; it needs a tokio runtime.
 //! - [`Ledger`] remembers key_IDs, in memory or in a file, so that no key is handed out twice even
-//!   where a KME repeats itself.
-//! - [`Core`] is the rules alone, without I/O or clock, for programs that make the calls
+//!   if a KME repeats keys.
+//! - [`Core`] contains only the rules, without I/O or clock, for programs that make the calls
 //!   themselves.
 
 mod core;
@@ -25,17 +25,17 @@ pub use ledger::{Ledger, LedgerError};
 
 use crate::{Client, Error, Key, RetryPolicy};
 
-/// Keys drawn ahead for one peer SAE, each handed out once.
+/// Keys drawn in advance for one peer SAE. Each is handed out once.
 ///
-/// A task draws keys with `enc_keys`, so this SAE is the master; the peer draws the same keys by
-/// their key_IDs with [`dec_keys`](Client::dec_keys). How it asks is told at [`Core`]. A key whose
-/// key_ID the [`Ledger`] knows is dropped; with a ledger in a file, a key can be taken only after
-/// its key_ID is on stable storage.
+/// A task draws keys with `enc_keys`, so this SAE is the master. The peer draws the same keys by
+/// their key_IDs with [`dec_keys`](Client::dec_keys). [`Core`] describes how the task asks. A key
+/// whose key_ID the [`Ledger`] knows is dropped. With a ledger in a file, a key can be taken only
+/// after its key_ID is on stable storage.
 ///
-/// Cheap to clone: all clones are one pool, usable from any task or thread. When the last clone is
-/// dropped, the task ends and keys that nobody took are dropped and zeroized.
+/// It is cheap to clone: all clones are one pool, usable from any task or thread. When the last
+/// clone is dropped, the task ends, and the remaining keys are dropped and zeroized.
 ///
-/// The task makes each call once and waits after failures by rules of its own; the client's
+/// The task makes each call once and waits after failures by its own rules; the client's
 /// [`RetryPolicy`] does not apply.
 ///
 /// ```no_run
@@ -54,13 +54,13 @@ pub struct KeyPool {
     running: Arc<Running>,
 }
 
-/// Ends the pool with its last handle.
+/// Ends the pool when the last handle is dropped.
 struct Running {
     shared: Arc<PoolShared>,
     task: AbortHandle,
 }
 
-/// What the handles and the task have in common.
+/// The state that the handles and the task share.
 struct PoolShared {
     peer: String,
     size: Option<u32>,
@@ -69,7 +69,7 @@ struct PoolShared {
     state: Mutex<PoolState>,
     /// Wakes the task.
     changed: Notify,
-    /// Wakes those that wait for a key, one for each.
+    /// Wakes the tasks that wait for a key, one for each key.
     arrived: Notify,
 }
 
@@ -78,7 +78,7 @@ struct PoolState {
     last_failure: Option<String>,
 }
 
-/// Sets up a [`KeyPool`]. Made by [`KeyPool::builder`].
+/// Builds a [`KeyPool`]. Returned by [`KeyPool::builder`].
 #[derive(Debug)]
 #[must_use]
 pub struct KeyPoolBuilder {
@@ -96,59 +96,59 @@ pub struct KeyPoolBuilder {
 pub struct TakeError {
     /// The peer SAE.
     pub peer: String,
-    /// How long was waited.
+    /// The time that was waited.
     pub waited: Duration,
     /// Why the last call to the KME, or the ledger, failed, if one did since the last key came.
     pub last_failure: Option<String>,
 }
 
 impl KeyPoolBuilder {
-    /// Size of each key in bits. Default the KME's [`key_size`](crate::Status::key_size).
+    /// Sets the size of each key in bits. Default the KME's [`key_size`](crate::Status::key_size).
     pub fn size(mut self, bits: u32) -> Self {
         self.size = Some(bits);
         self
     }
 
-    /// Keys to hold ahead. Default 16.
+    /// Sets the number of keys to hold in advance. Default 16.
     pub fn target(mut self, keys: usize) -> Self {
         self.settings.target = keys;
         self
     }
 
-    /// Most keys that one call asks for, and so most that a call that is cut off can lose.
-    /// Default 8. The KME's `max_key_per_request` counts where it is smaller.
+    /// Sets the most keys that one call asks for, and so the most that a call can lose if it is cut
+    /// off. Default 8. The KME's `max_key_per_request` applies if it is smaller.
     pub fn batch(mut self, keys: u32) -> Self {
         self.settings.batch = keys;
         self
     }
 
-    /// Most calls for keys at a time. Default 4.
+    /// Sets the most calls for keys at a time. Default 4.
     pub fn calls(mut self, calls: usize) -> Self {
         self.settings.calls = calls;
         self
     }
 
-    /// Age at which a key that nobody took is dropped and another drawn. Default ten minutes: many
-    /// KMEs wipe keys that the peer does not draw in time.
+    /// Sets the age at which a key that nobody took is dropped and replaced. Default ten minutes:
+    /// many KMEs delete keys that the peer does not draw in time.
     pub fn max_age(mut self, age: Duration) -> Self {
         self.settings.max_age = age;
         self
     }
 
-    /// Where key_IDs are remembered. Default a ledger of this pool's own, in memory.
+    /// Sets the ledger that remembers key_IDs. Default a ledger in memory, of this pool only.
     pub fn ledger(mut self, ledger: Ledger) -> Self {
         self.ledger = ledger;
         self
     }
 
-    /// Starts the pool on the tokio runtime it is called in.
+    /// Starts the pool on the current tokio runtime.
     ///
     /// # Errors
-    /// [`Error::Request`] where the peer's ID or the size cannot be asked for, [`Error::Config`]
-    /// outside a runtime.
+    /// [`Error::Request`] if the peer's ID or the size is not possible, [`Error::Config`] outside a
+    /// runtime.
     pub fn build(self) -> Result<KeyPool, Error> {
         let Self { client, peer, size, settings, ledger } = self;
-        // The pool repeats by its own rules; the client's within them would multiply.
+        // The pool repeats by its own rules; repeats of the client within them would multiply.
         let client = client.with_retry(RetryPolicy::none());
         client.url(&peer, "enc_keys")?;
         if size.is_some_and(|bits| bits == 0 || !bits.is_multiple_of(8)) {
@@ -175,7 +175,7 @@ impl KeyPoolBuilder {
 }
 
 impl KeyPool {
-    /// Starts the settings of a pool of keys to share with `peer_sae`, drawn by `client`.
+    /// Returns a builder for a pool of keys to share with `peer_sae`, drawn by `client`.
     pub fn builder(client: Client, peer_sae: impl Into<String>) -> KeyPoolBuilder {
         KeyPoolBuilder {
             client,
@@ -186,7 +186,7 @@ impl KeyPool {
         }
     }
 
-    /// Hands out the oldest key, if one is there. Never waits for the KME or a disk.
+    /// Takes the oldest key, if there is one. Never waits for the KME or a disk.
     #[must_use]
     pub fn try_take(&self) -> Option<Key> {
         let shared = &self.running.shared;
@@ -201,16 +201,16 @@ impl KeyPool {
         key
     }
 
-    /// Hands out the oldest key, and waits for one until `deadline` where none is there. Those that
-    /// wait are served in no set order. A call that is dropped has taken nothing.
+    /// Takes the oldest key. If there is none, waits for one until `deadline`. Waiting callers are
+    /// served in no particular order. A call that is dropped has taken nothing.
     ///
     /// # Errors
-    /// [`TakeError`] says why none came.
+    /// [`TakeError`] contains the reason why no key came.
     pub async fn take(&self, deadline: Instant) -> Result<Key, TakeError> {
         let shared = &self.running.shared;
         let began = Instant::now();
         loop {
-            // Begins to wait before it looks, so that no arrival is missed in between.
+            // The wait begins before the check, so that no arrival in between is missed.
             let mut arrived = std::pin::pin!(shared.arrived.notified());
             arrived.as_mut().enable();
             if let Some(key) = self.try_take() {
@@ -226,29 +226,29 @@ impl KeyPool {
         }
     }
 
-    /// How the pool stands.
+    /// Returns the state of the pool.
     #[must_use]
     pub fn status(&self) -> PoolStatus {
         let shared = &self.running.shared;
         shared.state().core.status(shared.now())
     }
 
-    /// Why the last call to the KME, or the ledger, failed, if one did since the last key came.
-    /// Holds nothing of a key.
+    /// Returns why the last call to the KME, or the ledger, failed, if one did since the last key
+    /// came. Contains nothing of a key.
     #[must_use]
     pub fn last_failure(&self) -> Option<String> {
         self.running.shared.state().last_failure.clone()
     }
 
-    /// How many keys to hold ahead from now on. Keys beyond it stay until they are taken or too
-    /// old.
+    /// Sets how many keys to hold in advance from now on. Keys beyond it stay until they are taken
+    /// or too old.
     pub fn set_target(&self, keys: usize) {
         let shared = &self.running.shared;
         shared.state().core.set_target(keys);
         shared.changed.notify_one();
     }
 
-    /// The peer SAE.
+    /// Returns the peer SAE.
     #[must_use]
     pub fn peer(&self) -> &str {
         &self.running.shared.peer
@@ -260,7 +260,7 @@ impl PoolShared {
         self.started.elapsed()
     }
 
-    /// Nothing in the state is left half changed by a panic.
+    /// Locks the state. A panic leaves no part of it half changed, so poisoning is ignored.
     fn state(&self) -> MutexGuard<'_, PoolState> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -269,7 +269,7 @@ impl PoolShared {
 impl Drop for Running {
     fn drop(&mut self) {
         self.task.abort();
-        // The task may hold on to the rest for a moment, but not to the keys.
+        // The task may keep the rest for a moment, but not the keys.
         self.shared.state().core.clear();
     }
 }

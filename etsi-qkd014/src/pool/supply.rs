@@ -1,15 +1,15 @@
-//! How many keys a second the KME gives.
+//! Measures how many keys per second the KME gives.
 
 use std::time::Duration;
 
 use super::core::Stock;
 
-/// Time spent waiting for keys before their rate means anything.
+/// Seconds of waiting for keys before the rate is meaningful.
 const ENOUGH: f64 = 1.0;
-/// Waiting that counts whole; what lies before it counts half, and half of that.
+/// Seconds of waiting that count fully. Earlier waiting counts half, and again half.
 const WINDOW: f64 = 10.0;
 
-/// Measures the supply: from the waits for keys, and from a stock that shrinks.
+/// Measures the supply from the waits for keys and from a shrinking stock.
 #[derive(Default)]
 pub(super) struct Supply {
     obtained: f64,
@@ -20,7 +20,8 @@ pub(super) struct Supply {
 }
 
 impl Supply {
-    /// A call ended with `keys`, `waited` after the one before, or after keys were first wanted.
+    /// Records a call that ended with `keys`, `waited` after the previous one, or after keys were
+    /// first wanted.
     pub(super) fn answered(&mut self, waited: Duration, keys: usize) {
         if self.waited > WINDOW {
             self.waited /= 2.0;
@@ -35,7 +36,7 @@ impl Supply {
         let count = stock.stored_key_count as f64;
         if let Some((then, before)) = self.stock {
             let passed = now.saturating_sub(then).as_secs_f64();
-            // A stock that does not shrink, as a full one, does not show its limit.
+            // A stock that does not shrink, for example a full one, does not show its limit.
             self.fill = (passed > 0.0 && count > 0.0 && count < before)
                 .then(|| ((count - before + self.obtained_since_stock) / passed).max(0.0));
         }
@@ -43,7 +44,7 @@ impl Supply {
         self.stock = Some((now, count));
     }
 
-    /// Keys a second, where the KME was seen at its limit.
+    /// Returns the keys per second, if the KME was seen at its limit.
     pub(super) fn rate(&self) -> Option<f64> {
         let waited = (self.waited >= ENOUGH).then(|| self.obtained / self.waited);
         [waited, self.fill].into_iter().flatten().reduce(f64::min)

@@ -1,4 +1,4 @@
-//! The task of a pool: makes the calls that the rules ask for.
+//! The task of a pool, which makes the calls that the rules return.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -10,10 +10,10 @@ use super::core::{Ask, FailureClass, Stock};
 use super::{LedgerError, PoolShared};
 use crate::{Client, Error, Key, Status, tls};
 
-/// Sleep where nothing is to come by itself.
+/// Time to sleep if no timer is due.
 const IDLE_SLEEP: Duration = Duration::from_secs(3600);
 
-/// How a call ended.
+/// The result of a call.
 enum Ended {
     Status(Result<Status, Error>),
     Keys(u32, Result<Usable, NoKeys>),
@@ -32,12 +32,12 @@ enum NoKeys {
 
 pub(super) fn jitter() -> u8 {
     let mut byte = [0];
-    // Without randomness the pause is only less spread.
+    // Without randomness, the pauses are only less spread.
     let _ = tls::provider().secure_random.fill(&mut byte);
     byte[0]
 }
 
-/// Runs until it is aborted; calls in flight end with it.
+/// Runs the task until it is aborted; calls in flight end with it.
 pub(super) async fn run(client: Client, shared: Arc<PoolShared>) {
     let mut calls = JoinSet::new();
     loop {
@@ -51,7 +51,7 @@ pub(super) async fn run(client: Client, shared: Arc<PoolShared>) {
         };
         tokio::select! {
             Some(ended) = calls.join_next() => {
-                // A call that panicked stays in flight for the rules: the pool asks for less.
+                // A call that panicked stays in flight for the rules, so the pool asks for less.
                 if let Ok(ended) = ended {
                     shared.ended(ended);
                 }
@@ -75,7 +75,7 @@ async fn draw(client: &Client, shared: &PoolShared, number: u32) -> Result<Usabl
         request = request.size(bits);
     }
     let mut keys = request.send().await.map_err(NoKeys::Kme)?.keys;
-    // The blocking part gets the key_IDs only, so that the keys are dropped with this task.
+    // The blocking part gets only the key_IDs, so that the keys are dropped with this task.
     let key_ids: Vec<String> = keys.iter().map(|key| key.key_id().to_owned()).collect();
     let ledger = shared.ledger.clone();
     let recorded = if ledger.blocks() {

@@ -1,4 +1,4 @@
-//! The three methods, as a KME answers them.
+//! The answers of a KME to the three methods.
 
 use std::collections::BTreeSet;
 
@@ -15,17 +15,16 @@ use super::network::{KmeState, NetworkShared};
 use super::plan::Method;
 use super::store::{Drawn, Refusal, uuid};
 
-/// A member of this name in a mandatory or optional extension is returned in
-/// `key_container_extension`.
+/// The KME returns a member of this name, in a mandatory or optional extension, in `key_container_extension`.
 const ECHO: &str = "kme_sim_echo";
 
-/// A member of this name in a mandatory or optional extension asks for a kind of route, and every
-/// key says in its `key_extension` which it has: each two KMEs of a network have a link of their
-/// own, so there are [`DIRECT`] routes only.
+/// A member of this name, in a mandatory or optional extension, asks for a kind of route. Every key then states its
+/// kind in its `key_extension`. Any two KMEs of a network have a link of their own, so there are only [`DIRECT`]
+/// routes.
 const ROUTE: &str = "kme_sim_route_type";
 const DIRECT: &str = "direct";
 
-/// The mandatory extensions that are not refused, as the `status_extension` says.
+/// The mandatory extensions that are supported, as listed in the `status_extension`.
 const EXTENSIONS: [&str; 2] = [ECHO, ROUTE];
 
 #[derive(Default, serde::Deserialize)]
@@ -63,7 +62,7 @@ struct KeyIdItem {
 trait Body: DeserializeOwned {
     /// The members that the specification lists.
     const MEMBERS: &'static [&'static str];
-    /// The member that is an array of objects, and the members that these have.
+    /// The member that is an array of objects, and the members of these objects.
     const ITEMS: Option<(&'static str, &'static [&'static str])>;
 }
 
@@ -84,20 +83,20 @@ impl Body for KeyIds {
         Some(("key_IDs", &["key_ID", "key_ID_extension"]));
 }
 
-/// Leaves what is there of `members`. The specification forbids neither others, nor a `null` where an
-/// optional member is absent; a mandatory one that is `null` is missing.
+/// Removes members that are not in `members`, and members that are `null`. The specification forbids neither other
+/// members nor `null` for an absent optional member. A mandatory member that is `null` is then missing.
 fn prune(object: &mut serde_json::Map<String, Value>, members: &[&str]) {
     object.retain(|name, value| members.contains(&name.as_str()) && !value.is_null());
 }
 
-/// The JSON object that a POST carries.
+/// Parses the JSON object of a POST.
 fn posted<B: Body>(request: &Request, strict: bool) -> Result<B, Answer> {
     let unreadable = |error| bad(format!("the body cannot be read: {error}"));
     let whole = || serde_json::from_slice::<Object<B>>(&request.body).map(|Object(body)| body);
     if strict {
         return whole().map_err(unreadable);
     }
-    // Every member that enc_keys has is optional, and so may the body be that has none (clause 6.2).
+    // All members of enc_keys are optional, so a body without any may be empty (clause 6.2).
     let body: &[u8] = if request.body.is_empty() { b"{}" } else { &request.body[..] };
     let Object(Unique(mut object)) = serde_json::from_slice(body).map_err(unreadable)?;
     prune(&mut object, B::MEMBERS);
@@ -111,7 +110,7 @@ fn posted<B: Body>(request: &Request, strict: bool) -> Result<B, Answer> {
         .map_err(unreadable)
 }
 
-/// The members of an object, none of them twice.
+/// The members of an object. Parsing refuses duplicates.
 struct Unique(serde_json::Map<String, Value>);
 
 impl<'de> Deserialize<'de> for Unique {
@@ -140,7 +139,7 @@ impl<'de> Deserialize<'de> for Unique {
     }
 }
 
-/// A JSON object and nothing else: a derived `Deserialize` takes an array of the members too.
+/// A JSON object only; a derived `Deserialize` would also accept an array of the members.
 struct Object<T>(T);
 
 impl<'de, T: DeserializeOwned> Deserialize<'de> for Object<T> {
@@ -162,7 +161,7 @@ impl<'de, T: DeserializeOwned> Deserialize<'de> for Object<T> {
     }
 }
 
-/// A member that may be left out, but is not `null`.
+/// Parses a member that may be absent, but not `null`.
 fn present<'de, D: Deserializer<'de>>(from: D) -> Result<Option<u64>, D::Error> {
     u64::deserialize(from).map(Some)
 }
@@ -180,11 +179,11 @@ pub(super) fn answer(
     if answer.status != 200 {
         kme.count(|counters| counters.refused += 1);
     }
-    // The answer to a HEAD has no body, and this one has.
+    // The answer to a HEAD must not have a body, but this one has, so the connection is closed.
     Answer { close: request.close || request.method == "HEAD", ..answer }
 }
 
-/// The method that a request names, whether or not it can be served.
+/// Returns the method that a request names, whether or not it can be served.
 pub(super) fn method(request: &Request) -> Option<Method> {
     let (_, name) = request.path.strip_prefix("/api/v1/keys/")?.split_once('/')?;
     Method::named(name)
@@ -248,7 +247,7 @@ fn route(
     if get && !request.body.is_empty() {
         return Err(bad("a GET has no body"));
     }
-    // A body that is not there has no type.
+    // An absent body needs no media type.
     if !get && !request.json && (shared.strict || !request.body.is_empty()) {
         return Err(bad("the Content-Type is not application/json"));
     }
@@ -399,7 +398,7 @@ fn enc_keys(
     Ok(container(drawn, &extensions, fault))
 }
 
-/// Refuses mandatory extensions that are not supported, or that are supported and not available (clause 6.2).
+/// Refuses mandatory extensions that are not supported, or whose request cannot be met (clause 6.2).
 fn mandatory(extensions: &[serde_json::Map<String, Value>]) -> Result<(), Answer> {
     let all = || extensions.iter().flatten();
     let details = |what: &str, of: Vec<(&String, &str)>| -> Vec<Value> {
@@ -451,7 +450,7 @@ fn dec_keys(
     Ok(container(given, &Extensions::default(), fault))
 }
 
-/// JSON texts that go with keys; nothing secret.
+/// JSON texts that go with keys. They contain no secret.
 #[derive(Default)]
 struct Extensions {
     /// `key_container_extension`.
@@ -460,7 +459,7 @@ struct Extensions {
     key: Option<String>,
 }
 
-/// Writes a key container without a copy of a key outside zeroized memory.
+/// Writes a key container without leaving a copy of a key outside zeroized memory.
 fn container(mut keys: Vec<Drawn>, extensions: &Extensions, fault: Option<&Fault>) -> Answer {
     match fault {
         Some(Fault::WrongLength) => keys.iter_mut().for_each(|key| {

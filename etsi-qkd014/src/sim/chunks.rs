@@ -1,4 +1,4 @@
-//! Bodies of requests that come in chunks (RFC 9112, 7.1).
+//! Reads chunked request bodies (RFC 9112, 7.1).
 
 use std::ops::Range;
 
@@ -6,13 +6,13 @@ use tokio::io::{AsyncRead, AsyncReadExt};
 
 use super::http::{MAX_BODY, MAX_HEAD, NoRequest, TOO_LARGE};
 
-/// Of the line that says how long a chunk is, with its extensions.
+/// Longest line with a chunk's length and extensions, in bytes.
 const MAX_LINE: usize = 256;
 
 const MALFORMED: NoRequest = NoRequest::Refused(400, "the body's chunks cannot be read");
 
-/// Reads a body and its trailer, which begin at `at` of `buffer`. Returns the body, and where in `buffer` that is
-/// behind it begins. Extensions and trailer are passed over.
+/// Reads a body and its trailer, which begin at `at` of `buffer`. Returns the body, and the index in `buffer` behind
+/// it. Ignores extensions and the trailer.
 ///
 /// # Errors
 /// The body is too large, its chunks are ambiguous, or the client is gone.
@@ -54,7 +54,7 @@ pub(super) async fn read<S: AsyncRead + Unpin>(
     }
 }
 
-/// What a client sends. What was read of it is taken out of the buffer before more is put in.
+/// The bytes from a client. Bytes that were read are removed from the buffer before more are added.
 struct Input<'a, S> {
     stream: &'a mut S,
     buffer: &'a mut Vec<u8>,
@@ -71,7 +71,7 @@ impl<S: AsyncRead + Unpin> Input<'_, S> {
         }
     }
 
-    /// The next so many bytes.
+    /// Returns the range of the next `count` bytes.
     async fn bytes(&mut self, count: usize) -> Result<Range<usize>, NoRequest> {
         while self.buffer.len() - self.at < count {
             self.more().await?;
@@ -81,7 +81,7 @@ impl<S: AsyncRead + Unpin> Input<'_, S> {
         Ok(from..self.at)
     }
 
-    /// The next line without its end; `None` for one of more than `longest` bytes.
+    /// Returns the range of the next line without its end; `None` if it is longer than `longest` bytes.
     async fn line(&mut self, longest: usize) -> Result<Option<Range<usize>>, NoRequest> {
         loop {
             let rest = &self.buffer[self.at..];
@@ -99,7 +99,7 @@ impl<S: AsyncRead + Unpin> Input<'_, S> {
     }
 }
 
-/// How long a chunk is by its line; `None` where another reader of the same bytes might see it end elsewhere.
+/// Returns the length of a chunk from its line; `None` if another reader of the same bytes could see another length.
 fn size(line: &[u8]) -> Option<u64> {
     let digits = line.iter().take_while(|byte| byte.is_ascii_hexdigit()).count();
     let (number, rest) = line.split_at(digits);
@@ -107,7 +107,7 @@ fn size(line: &[u8]) -> Option<u64> {
     if !is_extension || rest.iter().any(|byte| byte.is_ascii_control() && *byte != b'\t') {
         return None;
     }
-    // More digits than fit are an error of the parser.
+    // The parser reports too many digits as an error.
     u64::from_str_radix(str::from_utf8(number).ok()?, 16).ok()
 }
 

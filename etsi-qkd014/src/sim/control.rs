@@ -1,9 +1,9 @@
-//! Faults changed while the KMEs run, by HTTP on a loopback address.
+//! Changes faults while the KMEs run, by HTTP on a loopback address.
 //!
-//! A program that reaches the address may break the KMEs, and every local program can reach it, web
-//! browsers included. A page in a browser must not: a request needs the address itself as `Host` (no name
-//! that a page could rebind), no `Origin`, the header `X-Kme-Sim: 1`, which a page cannot send
-//! without asking first, and JSON as its media type. There is no answer to that question.
+//! A program that can connect to the address can break the KMEs. Every local program can, including web browsers. A
+//! page in a browser must not: a request needs the address itself as `Host` (not a name that a page could rebind), no
+//! `Origin`, JSON as its media type, and the header `X-Kme-Sim: 1`. A page cannot send that header without a preflight
+//! request, which is never answered with consent.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
@@ -22,12 +22,12 @@ const MAX_CONNECTIONS: usize = 16;
 const MAX_HEAD: usize = 8 << 10;
 const MAX_BODY: usize = 64 << 10;
 const MAX_HEADERS: usize = 32;
-/// Plans that wait at one KME.
+/// Most plans that wait at one KME.
 const MAX_PLANS: usize = 256;
-/// From the connection to the last byte of the answer.
+/// Time from the connection to the last byte of the answer.
 const TIME: Duration = Duration::from_secs(5);
 
-/// An address at which the faults of a [`Network`] can be read and changed while it runs.
+/// An address at which the faults of a running [`Network`] can be read and changed.
 ///
 /// | request | does |
 /// | --- | --- |
@@ -37,7 +37,7 @@ const TIME: Duration = Duration::from_secs(5);
 /// | `POST /faults/KME` | adds an array of plans |
 /// | `DELETE /faults/KME` | removes all plans |
 ///
-/// The answer to a change is the KME's plans after it. Every request carries `X-Kme-Sim: 1`.
+/// The answer to a change contains the KME's plans after it. Every request must have `X-Kme-Sim: 1`.
 #[derive(Debug)]
 pub struct Control {
     listener: TcpListener,
@@ -45,10 +45,10 @@ pub struct Control {
 }
 
 impl Control {
-    /// Listens on `bind`, port 0 for any free one.
+    /// Listens on `bind`; port 0 is any free one.
     ///
     /// # Errors
-    /// [`Error::Layout`] where `bind` is not a loopback address, [`Error::Io`] where it is taken.
+    /// [`Error::Layout`] if `bind` is not a loopback address, [`Error::Io`] if it is in use.
     pub async fn bind(bind: SocketAddr) -> Result<Self, Error> {
         if !bind.ip().is_loopback() {
             return Err(Error::Layout(format!(
@@ -60,13 +60,13 @@ impl Control {
         Ok(Self { listener, addr })
     }
 
-    /// Where it listens.
+    /// Returns the address on which it listens.
     #[must_use]
     pub fn addr(&self) -> SocketAddr {
         self.addr
     }
 
-    /// Serves until the future is dropped, and takes its connections with it then.
+    /// Serves until the future is dropped, which also ends its connections.
     pub async fn serve(self, network: Arc<Network>) {
         let permits = Arc::new(Semaphore::new(MAX_CONNECTIONS));
         let mut connections = JoinSet::new();
@@ -80,14 +80,14 @@ impl Control {
             let (network, addr) = (Arc::clone(&network), self.addr);
             connections.spawn(async move {
                 let _permit = permit;
-                // A caller that breaks off is its own business.
+                // A caller that breaks off affects only itself.
                 let _ = tokio::time::timeout(TIME, connection(stream, addr, &network)).await;
             });
         }
     }
 }
 
-/// Serves one request; each connection has one.
+/// Serves the one request of a connection.
 async fn connection(
     mut stream: TcpStream,
     addr: SocketAddr,
@@ -110,7 +110,8 @@ async fn connection(
     stream.write_all(head.as_bytes()).await?;
     stream.write_all(body.as_bytes()).await?;
     stream.shutdown().await?;
-    // What the caller still sends is read, or closing would reset the answer away.
+    // Reads what the caller still sends, because closing with unread bytes would reset the connection and lose the
+    // answer.
     let mut sink = [0; 4096];
     while stream.read(&mut sink).await? > 0 {}
     Ok(())
@@ -119,7 +120,7 @@ async fn connection(
 struct Request {
     method: String,
     path: String,
-    /// Names in lower case.
+    /// The header names are in lower case.
     headers: BTreeMap<String, String>,
     body: Vec<u8>,
 }
@@ -130,7 +131,7 @@ fn error(status: u16, why: impl Into<String>) -> Answer {
     (status, json!({ "message": why.into() }))
 }
 
-/// Reads a request; within it, the status and reason where it is refused.
+/// Reads a request. The inner error is the status and the reason of a refusal.
 async fn read(stream: &mut TcpStream) -> std::io::Result<Result<Request, (u16, &'static str)>> {
     let mut buffer = Vec::new();
     let end = loop {
@@ -160,7 +161,7 @@ async fn read(stream: &mut TcpStream) -> std::io::Result<Result<Request, (u16, &
     Ok(Ok(request))
 }
 
-/// Parses a head; the body's length with it.
+/// Parses a head. Also returns the length of the body.
 fn head(bytes: &[u8]) -> Result<(Request, usize), &'static str> {
     let mut headers = [httparse::EMPTY_HEADER; MAX_HEADERS];
     let mut parsed = httparse::Request::new(&mut headers);
@@ -190,7 +191,7 @@ fn head(bytes: &[u8]) -> Result<(Request, usize), &'static str> {
     Ok((Request { method, path, headers, body: Vec::new() }, length))
 }
 
-/// Refuses what a page in a browser could have sent.
+/// Refuses a request that a page in a browser could have sent.
 fn allowed(request: &Request, addr: SocketAddr) -> Result<(), String> {
     let header = |name: &str| request.headers.get(name).map(String::as_str);
     if header("host") != Some(&addr.to_string()) {

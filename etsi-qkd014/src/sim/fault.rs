@@ -1,40 +1,40 @@
-//! Faults on demand: what a KME can do wrong, and how each is written.
+//! Faults on demand: the possible faults of a KME, and their textual form.
 
 use std::fmt;
 use std::str::FromStr;
 use std::time::Duration;
 
-/// What a KME does wrong to a request. Injected by [`Kme::inject`](super::Kme::inject), or with
-/// more say over when by [`Kme::plan`](super::Kme::plan).
+/// A fault of a KME in its handling of a request. [`Kme::inject`](super::Kme::inject) injects it;
+/// [`Kme::plan`](super::Kme::plan) gives more control over when it happens.
 ///
-/// Except where it says otherwise the request is served first, so that keys asked for are gone.
+/// Unless stated otherwise, the request is served first, so that the requested keys are consumed.
 ///
-/// As text it is a name, with a value where there is one: `cut`, `latency=250`, `status=500`.
+/// Its text is a name, with a value for some faults: `cut`, `latency=250`, `status=500`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Fault {
     /// `handshake-refused`: the TLS handshake is refused with the alert handshake_failure. Nothing
-    /// is served. Meets new connections only.
+    /// is served. Affects only new connections.
     HandshakeRefused,
-    /// `handshake-dropped`: the TCP connection is closed before the TLS handshake, without a word.
-    /// Nothing is served. Meets new connections only.
+    /// `handshake-dropped`: the TCP connection is closed before the TLS handshake, without an
+    /// alert. Nothing is served. Affects only new connections.
     HandshakeDropped,
-    /// `certificate-expired`: the KME shows a certificate that has expired. Meets new connections
-    /// only; a client that takes it all the same is served.
+    /// `certificate-expired`: the KME shows an expired certificate. Affects only new connections. A
+    /// client that accepts the certificate is served.
     CertificateExpired,
-    /// `certificate-not-yet-valid`: the KME shows a certificate of the future. Meets new
-    /// connections only; a client that takes it all the same is served.
+    /// `certificate-not-yet-valid`: the KME shows a certificate that is not valid yet. Affects only
+    /// new connections. A client that accepts the certificate is served.
     CertificateNotYetValid,
-    /// `latency=MILLISECONDS`: the answer comes this much later. Adds to whatever else the request
-    /// meets.
+    /// `latency=MILLISECONDS`: the answer is delayed by this time, in addition to other faults of
+    /// the request.
     Latency(Duration),
     /// `silence`: the answer never comes.
     Silence,
-    /// `drip=MILLISECONDS`: the answer comes a byte at a time, with this pause between two.
+    /// `drip=MILLISECONDS`: the answer comes one byte at a time, with this pause between two bytes.
     Drip(Duration),
-    /// `empty`: 503 as from an empty store. Nothing is served.
+    /// `empty`: 503, as from an empty store. Nothing is served.
     Empty,
-    /// `busy=SECONDS`: 503 that asks to come back after so long. Nothing is served.
+    /// `busy=SECONDS`: 503 with a Retry-After of this time. Nothing is served.
     Busy(u64),
     /// `status=CODE`: another status, without a JSON body. Nothing is served.
     Status(u16),
@@ -46,25 +46,25 @@ pub enum Fault {
     Garbage,
     /// `endless`: the answer's body never ends, and has no Content-Length.
     Endless,
-    /// `lying-length`: the Content-Length says more than any client should take.
+    /// `lying-length`: the Content-Length is larger than any client should accept.
     LyingLength,
-    /// `wrong-length`: keys are one byte short.
+    /// `wrong-length`: keys are one byte too short.
     WrongLength,
     /// `repeat-key-id`: all keys of an answer have the first one's key_ID.
     RepeatKeyId,
-    /// `reuse-key-id`: the first key of an answer to `enc_keys` has a key_ID that the KME handed
-    /// out in an answer before: that of the last key then, where there is one.
+    /// `reuse-key-id`: the first key of an answer to `enc_keys` has a key_ID that the KME gave in
+    /// an earlier answer, namely that of its last key, if there is one.
     ReuseKeyId,
-    /// `key-kept`: `dec_keys` gives keys and keeps them, so that they are given again.
+    /// `key-kept`: `dec_keys` gives keys but keeps them, so that they can be given again.
     KeyKept,
-    /// `wrong-key`: the first key of an answer is not the one that the other SAE gets under its
-    /// key_ID: the two KMEs disagree about it.
+    /// `wrong-key`: the first key of an answer differs from the key that the other SAE gets under
+    /// its key_ID.
     WrongKey,
     /// `key-missing`: the first key is missing.
     KeyMissing,
-    /// `upper-case-ids`: key_IDs in upper case.
+    /// `upper-case-ids`: key_IDs are in upper case.
     UpperCaseIds,
-    /// `other-ids`: key_IDs that nobody asked for.
+    /// `other-ids`: key_IDs that were not requested.
     OtherIds,
     /// `media-type`: the answer is labelled `text/plain`.
     WrongMediaType,
@@ -72,14 +72,14 @@ pub enum Fault {
     Http10,
 }
 
-/// What a fault meets.
+/// What a fault affects.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Meets {
     Connection,
     Request,
 }
 
-/// The faults whose name is all there is to them.
+/// The faults without a value, by name.
 const PLAIN: [(&str, Fault); 20] = [
     ("handshake-refused", Fault::HandshakeRefused),
     ("handshake-dropped", Fault::HandshakeDropped),
@@ -103,9 +103,9 @@ const PLAIN: [(&str, Fault); 20] = [
     ("media-type", Fault::WrongMediaType),
 ];
 const HTTP_1_0: &str = "http-1.0";
-/// The faults that take a value, as the messages write them.
+/// The faults with a value, as messages show them.
 const WITH_VALUE: &str = "latency=MILLISECONDS, drip=MILLISECONDS, busy=SECONDS, status=CODE";
-/// A day. Longer pauses are typing errors.
+/// One day. A longer pause is a typing error.
 const MAX_PAUSE_MS: u64 = 86_400_000;
 
 impl Fault {
@@ -119,7 +119,7 @@ impl Fault {
         }
     }
 
-    /// Every way to write a fault, for messages.
+    /// Returns every way to write a fault, for messages.
     pub(super) fn all() -> String {
         let plain: Vec<_> = PLAIN.iter().map(|(name, _)| *name).chain([HTTP_1_0]).collect();
         format!("{}, {WITH_VALUE}", plain.join(", "))
@@ -145,7 +145,7 @@ impl fmt::Display for Fault {
 impl FromStr for Fault {
     type Err = String;
 
-    /// The error says what was read and what is accepted.
+    /// Parses a fault. The error contains the text and the accepted values.
     fn from_str(text: &str) -> Result<Self, String> {
         let unknown = || format!("{text:?} is no fault; there are: {}", Self::all());
         let Some((name, value)) = text.split_once('=') else {

@@ -1,4 +1,4 @@
-//! TLS as a KME speaks it: which certificate it shows, and how it refuses.
+//! The TLS of a KME: the certificates that it shows, and its refusals.
 
 use std::fmt;
 use std::sync::Arc;
@@ -22,7 +22,7 @@ use crate::tls;
 pub(super) const TIME: Duration = Duration::from_secs(10);
 const LINGER: Duration = Duration::from_secs(1);
 
-/// Who is told the secrets of TLS connections, if anybody is.
+/// The function that gets the secrets of TLS connections, if any.
 #[derive(Clone, Default)]
 pub(super) struct TlsWitness(Option<Arc<Tell>>);
 
@@ -78,7 +78,7 @@ impl Acceptors {
         })
     }
 
-    /// The one for a connection with this fault.
+    /// Returns the acceptor for a connection with this fault.
     pub(super) fn of(&self, fault: Option<&Fault>) -> &TlsAcceptor {
         match fault {
             Some(Fault::CertificateExpired) => &self.expired,
@@ -111,8 +111,8 @@ fn server_config(ca: &str, pair: &Pair, tls12_only: bool) -> Result<ServerConfig
         .map_err(|e| wrong(&e))
 }
 
-/// Refuses the handshake as a TLS server does that shares nothing with its client: after the
-/// ClientHello, with a fatal alert (RFC 8446, 6.2).
+/// Refuses the handshake like a TLS server that has no parameters in common with its client: with a
+/// fatal alert after the ClientHello (RFC 8446, 6.2).
 pub(super) async fn refuse(mut stream: TcpStream) -> std::io::Result<()> {
     const HANDSHAKE_FAILURE: [u8; 7] = [21, 3, 3, 0, 2, 2, 40];
     let mut first = [0];
@@ -124,8 +124,8 @@ pub(super) async fn refuse(mut stream: TcpStream) -> std::io::Result<()> {
     linger(stream).await
 }
 
-/// After a refusal: reads what the client has already sent, because closing over unread bytes
-/// resets the connection, and the client may then never see what says why.
+/// After a refusal, reads what the client has already sent. Closing with unread bytes would reset
+/// the connection, and the client might never see the reason.
 pub(super) async fn linger<S: AsyncRead + AsyncWrite + Unpin>(
     mut stream: S,
 ) -> std::io::Result<()> {
@@ -133,7 +133,7 @@ pub(super) async fn linger<S: AsyncRead + AsyncWrite + Unpin>(
     tokio::time::timeout(LINGER, until_gone(&mut stream)).await.unwrap_or(Ok(()))
 }
 
-/// Reads, and forgets, until the client is gone.
+/// Reads and discards until the client is gone.
 pub(super) async fn until_gone<S: AsyncRead + Unpin>(stream: &mut S) -> std::io::Result<()> {
     let mut sink = [0; 4096];
     while stream.read(&mut sink).await? > 0 {}

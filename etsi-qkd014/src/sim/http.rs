@@ -1,5 +1,5 @@
-//! HTTP/1.1 as far as this interface needs it: requests whose body has a Content-Length or comes in
-//! chunks, one after the other or pipelined, and answers that can also be wrong on purpose.
+//! The part of HTTP/1.1 that this interface needs: requests whose body has a Content-Length or is chunked, one after
+//! the other or pipelined, and answers that can be wrong on purpose.
 
 use std::time::Duration;
 
@@ -11,40 +11,40 @@ use super::{chunks, fault::Fault};
 pub(super) const MAX_HEAD: usize = 16 << 10;
 pub(super) const MAX_BODY: usize = 1 << 20;
 pub(super) const TOO_LARGE: NoRequest = NoRequest::Refused(413, "the body is larger than 1 MiB");
-/// A buffer that has grown beyond it is given back when it is empty.
+/// Size in bytes above which an empty buffer is freed.
 const KEPT_BUFFER: usize = 32 << 10;
 
 #[derive(Debug)]
 pub(super) struct Request {
     pub(super) method: String,
-    /// Path, without the query.
+    /// The path without the query.
     pub(super) path: String,
     pub(super) query: String,
-    /// Whether the body is labelled application/json.
+    /// True if the body is labelled application/json.
     pub(super) json: bool,
-    /// Whether the client wants the connection closed after the answer.
+    /// True if the client wants the connection closed after the answer.
     pub(super) close: bool,
     pub(super) body: Vec<u8>,
 }
 
-/// Why there is no request.
+/// The reason why there is no request.
 pub(super) enum NoRequest {
-    /// The client is done, or gone.
+    /// The client has finished, or is gone.
     Closed,
-    /// What came is not accepted: the status and the message that say so.
+    /// The input is not accepted: the status and the message of the refusal.
     Refused(u16, &'static str),
 }
 
 pub(super) struct Answer {
     pub(super) status: u16,
     pub(super) body: Zeroizing<String>,
-    /// Seconds, for the header Retry-After.
+    /// Seconds for the header Retry-After.
     pub(super) retry_after: Option<u64>,
-    /// Closes the connection after it.
+    /// True if the connection is closed after the answer.
     pub(super) close: bool,
 }
 
-/// Reads one request. `buffer` keeps what came after it. Where `strict`, a body needs a Content-Length.
+/// Reads one request. `buffer` keeps the bytes after it. If `strict`, a body needs a Content-Length.
 pub(super) async fn read<S: AsyncRead + AsyncWrite + Unpin>(
     stream: &mut S,
     buffer: &mut Vec<u8>,
@@ -52,7 +52,7 @@ pub(super) async fn read<S: AsyncRead + AsyncWrite + Unpin>(
 ) -> Result<Request, NoRequest> {
     let mut searched = 0;
     let end = loop {
-        // What ends a head may have begun in what was searched before.
+        // The end of the head may have begun in the part that was already searched.
         let from = usize::saturating_sub(searched, 3);
         if let Some(at) = buffer[from..].windows(4).position(|window| window == b"\r\n\r\n") {
             break from + at;
@@ -108,15 +108,15 @@ pub(super) async fn read<S: AsyncRead + AsyncWrite + Unpin>(
 
 struct Head {
     request: Request,
-    /// Of the body.
+    /// The length of the body.
     length: usize,
-    /// The transfer codings, of which the last one says where the body ends.
+    /// The transfer codings; the last one determines where the body ends.
     coding: Option<String>,
-    /// Whether the client sends the body only when it is told to (RFC 9110, 10.1.1).
+    /// True if the client waits for 100 Continue before it sends the body (RFC 9110, 10.1.1).
     waits: bool,
 }
 
-/// Parses a request's head. A request of HTTP/1.1 names one host (RFC 9112, 3.2).
+/// Parses a request's head. A request of HTTP/1.1 must name one host (RFC 9112, 3.2).
 fn head(bytes: &[u8]) -> Option<Head> {
     let text = std::str::from_utf8(bytes).ok()?;
     let mut lines = text.split("\r\n");
@@ -130,7 +130,7 @@ fn head(bytes: &[u8]) -> Option<Head> {
     let (mut coding, mut waits) = (None::<String>, false);
     for line in lines {
         let (name, value) = line.split_once(':')?;
-        // No space beside a name, and so no folded line (RFC 9112, 5.1 and 5.2).
+        // No space before the colon, and no folded line (RFC 9112, 5.1 and 5.2).
         if name.is_empty() || name.contains([' ', '\t']) {
             return None;
         }
@@ -143,7 +143,7 @@ fn head(bytes: &[u8]) -> Option<Head> {
         }
         if name.eq_ignore_ascii_case("transfer-encoding") {
             let value = value.trim();
-            // Several headers are one list (RFC 9110, 5.3).
+            // Several headers of this name form one list (RFC 9110, 5.3).
             coding =
                 Some(coding.map_or_else(|| value.to_owned(), |first| format!("{first}, {value}")));
         }
@@ -159,7 +159,7 @@ fn head(bytes: &[u8]) -> Option<Head> {
             close |= value.split(',').any(|option| option.trim().eq_ignore_ascii_case("close"));
         }
     }
-    // Two ways to say where a body ends are one too many (RFC 9112, 6.1).
+    // A body must not have both a coding and a length (RFC 9112, 6.1).
     if hosts != 1 || (coding.is_some() && length.is_some()) {
         return None;
     }
@@ -176,7 +176,7 @@ fn head(bytes: &[u8]) -> Option<Head> {
     Some(Head { request, length: length.unwrap_or(0), coding, waits })
 }
 
-/// Undoes percent-encoding; `None` where it is broken or not UTF-8.
+/// Decodes percent-encoding; `None` if it is malformed or not UTF-8.
 pub(super) fn percent_decode(text: &str) -> Option<String> {
     let mut out = Vec::with_capacity(text.len());
     let mut bytes = text.bytes();
@@ -193,7 +193,7 @@ pub(super) fn percent_decode(text: &str) -> Option<String> {
     String::from_utf8(out).ok()
 }
 
-/// Writes an answer, wrong in the way of `fault`. Returns whether the connection stays open.
+/// Writes an answer, with the given fault. Returns whether the connection stays open.
 pub(super) async fn write<S: AsyncWrite + Unpin>(
     stream: &mut S,
     answer: &Answer,
@@ -220,7 +220,7 @@ pub(super) async fn write<S: AsyncWrite + Unpin>(
         Some(Fault::Http10) => head.push_str("\r\n"),
         _ => head.push_str(&format!("Content-Length: {length}\r\n\r\n")),
     }
-    // One write, so that an answer is one TLS record where it fits.
+    // One write, so that an answer is one TLS record if it fits.
     let mut bytes = Zeroizing::new(Vec::with_capacity(head.len() + body.len()));
     bytes.extend_from_slice(head.as_bytes());
     match fault {

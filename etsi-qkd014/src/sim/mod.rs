@@ -1,9 +1,10 @@
-//! KMEs in process that share key material as a QKD link does. For tests and demonstrations.
+//! KMEs in the same process that share key material like a QKD link. For tests and demonstrations.
 //!
-//! A [`Network`] is one or more KMEs with a throw-away CA, each serving ETSI GS QKD 014 over real
-//! mutual TLS to the SAEs attached to it. Which SAE calls is read from its certificate's common
-//! name. Keys come from the system's random number generator, wait in a store that fills at a set
-//! rate, are given once to the master, and once to each slave that the master named.
+//! A [`Network`] contains one or more KMEs and a throw-away CA. Each KME serves ETSI GS QKD 014
+//! over real mutual TLS to the SAEs attached to it. It identifies an SAE by the common name of its
+//! certificate. Keys come from the system's random number generator and wait in a store that fills
+//! at a set rate. Each key is given once to the master, and once to each slave that the master
+//! named.
 //!
 //! ```
 //! # #[tokio::main(flavor = "current_thread")]
@@ -25,7 +26,7 @@
 //! # }
 //! ```
 //!
-//! It is no KME for production: its keys have never seen a quantum channel.
+//! It is not a KME for production: its keys do not come from a quantum channel.
 
 mod api;
 mod chunks;
@@ -46,17 +47,17 @@ pub use pki::{Layout, Pki, Sae, Site};
 pub use plan::{FaultPlan, Method};
 pub use store::FillRate;
 
-/// Why a simulator could not be set up.
+/// The reason why a simulator could not be set up.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// The KMEs and SAEs do not fit together.
+    /// The KMEs and SAEs are inconsistent.
     #[error("{0}")]
     Layout(String),
-    /// A certificate could not be made or read.
+    /// A certificate could not be created or read.
     #[error("certificates: {0}")]
     Certificates(String),
-    /// A file or socket.
+    /// A file or socket could not be used.
     #[error("{what}: {source}")]
     Io {
         /// The path or address.

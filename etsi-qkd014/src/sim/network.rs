@@ -1,4 +1,4 @@
-//! KMEs that run.
+//! Running KMEs.
 
 use std::collections::BTreeSet;
 use std::net::SocketAddr;
@@ -16,7 +16,7 @@ use super::store::{FillRate, Store, Witness};
 use super::{Error, server};
 use crate::{Client, ClientBuilder};
 
-/// What the KMEs promise in their status answers.
+/// The limits that the KMEs report in their status answers.
 #[derive(Clone, Debug)]
 pub(super) struct Limits {
     pub(super) key_size: u32,
@@ -27,7 +27,7 @@ pub(super) struct Limits {
     pub(super) max_sae_ids: u64,
 }
 
-/// Sets up a [`Network`].
+/// Builds a [`Network`].
 #[derive(Debug)]
 #[must_use]
 pub struct NetworkBuilder {
@@ -43,7 +43,7 @@ pub struct NetworkBuilder {
 }
 
 impl NetworkBuilder {
-    /// Adds a KME that listens on `bind` (port 0: any free one) and serves `saes`.
+    /// Adds a KME that listens on `bind` (port 0 is any free one) and serves `saes`.
     pub fn kme<I>(mut self, id: impl Into<String>, bind: SocketAddr, saes: I) -> Self
     where
         I: IntoIterator<Item: Into<String>>,
@@ -53,76 +53,76 @@ impl NetworkBuilder {
         self
     }
 
-    /// Takes the KMEs of a layout, with the certificates made for it.
+    /// Uses the KMEs of a layout, with the certificates created for it.
     pub fn layout(mut self, layout: Layout, pki: Pki) -> Self {
         self.layout = layout;
         self.pki = Some(pki);
         self
     }
 
-    /// Default size of a key in bits, a multiple of 8 from 8 to 4096. Default 256.
+    /// Sets the default size of a key in bits, a multiple of 8 from 8 to 4096. Default 256.
     pub fn key_size(mut self, bits: u32) -> Self {
         self.limits.key_size = bits;
         self
     }
 
-    /// How fast each link between two KMEs makes keys. Default unlimited.
+    /// Sets how fast each link between two KMEs makes keys. Default unlimited.
     pub fn fill_rate(mut self, rate: FillRate) -> Self {
         self.rate = rate;
         self
     }
 
-    /// Keys that each link stores at most, up to 2^53. Default 10,000.
+    /// Sets the most keys that each link stores, up to 2^53. Default 10,000.
     pub fn max_stored(mut self, keys: u64) -> Self {
         self.limits.max_stored = keys;
         self
     }
 
-    /// Keys that each link stores at the start. Default as many as it can.
+    /// Sets the number of keys that each link stores at the start. Default the maximum.
     pub fn initially_stored(mut self, keys: u64) -> Self {
         self.initially = Some(keys);
         self
     }
 
-    /// Most keys in one request, 1 to 1024. Default 128.
+    /// Sets the most keys in one request, 1 to 1024. Default 128.
     pub fn max_keys_per_request(mut self, keys: u64) -> Self {
         self.limits.max_keys_per_request = keys;
         self
     }
 
-    /// Offers TLS 1.2 and nothing newer, as old KMEs do.
+    /// Offers only TLS 1.2, like old KMEs.
     pub fn tls12_only(mut self) -> Self {
         self.tls12_only = true;
         self
     }
 
-    /// Refuses what the specification does not list: other members of a request, `null` for an absent
-    /// one, other parameters of a query, a POST of `enc_keys` with an empty body, a body in chunks. Clients
-    /// in the field send these, and ETSI GS QKD 014 does not forbid them, so by default they are accepted.
+    /// Refuses what the specification does not list: other members of a request, `null` for an absent one, other
+    /// parameters of a query, a POST of `enc_keys` with an empty body, a chunked body. Clients in the field send these,
+    /// and ETSI GS QKD 014 does not forbid them, so they are accepted by default.
     pub fn strict(mut self) -> Self {
         self.strict = true;
         self
     }
 
-    /// Calls `tell` with key_ID and secret of each key that a master draws, for tests that search
-    /// memory for keys.
+    /// Calls `tell` with the key_ID and the secret of each key that a master draws, for tests that search memory for
+    /// keys.
     pub fn witness(mut self, tell: impl Fn(&str, &[u8]) + Send + Sync + 'static) -> Self {
         self.witness = Witness::new(tell);
         self
     }
 
-    /// Calls `tell` with label (as in `SSLKEYLOGFILE`) and value of each secret of TLS connections, for tests that search
-    /// memory for them.
+    /// Calls `tell` with the label (as in `SSLKEYLOGFILE`) and the value of each secret of TLS connections, for tests
+    /// that search memory for them.
     pub fn tls_witness(mut self, tell: impl Fn(&str, &[u8]) + Send + Sync + 'static) -> Self {
         self.tls_witness = TlsWitness::new(tell);
         self
     }
 
-    /// Makes the certificates, binds and serves. Needs a tokio runtime, on which the KMEs run until
-    /// the network is dropped.
+    /// Creates the certificates, binds the sockets and starts to serve. Needs a tokio runtime, on which the KMEs run
+    /// until the network is dropped.
     ///
     /// # Errors
-    /// [`Error`] names the ID, setting or address that cannot be used.
+    /// [`Error`] names the unusable ID, setting or address.
     pub async fn start(self) -> Result<Network, Error> {
         let Self { layout, pki, limits, rate, initially, tls12_only, strict, witness, tls_witness } =
             self;
@@ -134,14 +134,14 @@ impl NetworkBuilder {
                 limits.key_size, limits.min_key_size, limits.max_key_size
             )));
         }
-        // A full answer stays below the 1 MiB that a client takes by default.
+        // A full answer stays below the 1 MiB that a client accepts by default.
         if !(1..=1024).contains(&limits.max_keys_per_request) {
             return Err(Error::Layout(format!(
                 "max_keys_per_request {} is not from 1 to 1024",
                 limits.max_keys_per_request
             )));
         }
-        // Beyond it a status could not be true: stocks are counted in 64-bit floats.
+        // Above it a status could not be exact, because stocks are counted in 64-bit floats.
         if limits.max_stored > 1 << 53 {
             return Err(Error::Layout(format!(
                 "max_stored {} is more than 2^53",
@@ -199,7 +199,7 @@ fn sae(id: &str, kme: &Kme, pki: &Pki, pair: Pair) -> Sae {
     }
 }
 
-/// KMEs that run until this is dropped.
+/// KMEs that run until this value is dropped.
 pub struct Network {
     kmes: Vec<Kme>,
     saes: Vec<Sae>,
@@ -208,7 +208,7 @@ pub struct Network {
 }
 
 impl Network {
-    /// Starts the settings of a network.
+    /// Returns a builder for a network.
     pub fn builder() -> NetworkBuilder {
         NetworkBuilder {
             layout: Layout::default(),
@@ -230,55 +230,55 @@ impl Network {
         }
     }
 
-    /// The KMEs, in the order in which they were added.
+    /// Returns the KMEs in the order in which they were added.
     #[must_use]
     pub fn kmes(&self) -> &[Kme] {
         &self.kmes
     }
 
-    /// A KME by its ID.
+    /// Returns a KME by its ID.
     #[must_use]
     pub fn kme(&self, id: &str) -> Option<&Kme> {
         self.kmes.iter().find(|kme| kme.id() == id)
     }
 
-    /// The SAEs of all KMEs.
+    /// Returns the SAEs of all KMEs.
     #[must_use]
     pub fn saes(&self) -> &[Sae] {
         &self.saes
     }
 
-    /// An SAE by its ID.
+    /// Returns an SAE by its ID.
     #[must_use]
     pub fn sae(&self, id: &str) -> Option<&Sae> {
         self.saes.iter().find(|sae| sae.id == id)
     }
 
-    /// Notes the state of the key stores, as a backup does. All keys drawn from here on are kept
-    /// for [`set_back`](Self::set_back).
+    /// Records the state of the key stores, like a backup. All keys drawn from here on are kept for
+    /// [`set_back`](Self::set_back).
     pub fn note_state(&self) {
         self.shared.store().note();
     }
 
-    /// Sets the key stores back to the state that was noted: the KMEs give the keys that were drawn
-    /// since then once more, in the same order, and can give them to the slaves once more.
+    /// Restores the recorded state of the key stores: the KMEs give the keys that were drawn since then once more, in
+    /// the same order, and can give them to the slaves once more.
     pub fn set_back(&self) {
         self.shared.store().set_back();
     }
 
-    /// Settings of a client that acts as the SAE `sae`.
+    /// Returns a builder for a client that acts as the SAE `sae`.
     ///
     /// # Panics
-    /// Where the network has no such SAE.
+    /// The network has no such SAE.
     pub fn client_builder(&self, sae: &str) -> ClientBuilder {
         client_builder(self.sae(sae).unwrap_or_else(|| panic!("no SAE {sae:?} in this network")))
     }
 
-    /// An SAE with a certificate of the network's CA that is attached to none of its KMEs, and the
-    /// KME `kme` to try.
+    /// Creates an SAE with a certificate of the network's CA that is attached to none of its KMEs, for calls to the KME
+    /// `kme`.
     ///
     /// # Errors
-    /// [`Error`] where there is no such KME, or the CA's key is gone.
+    /// [`Error`] if there is no such KME, or if the CA's key no longer exists.
     pub fn outsider(&self, id: &str, kme: &str) -> Result<Sae, Error> {
         let kme = self
             .kme(kme)
@@ -296,7 +296,7 @@ impl Network {
     }
 }
 
-/// Settings of a client that acts as `sae`.
+/// Returns a builder for a client that acts as `sae`.
 pub(super) fn client_builder(sae: &Sae) -> ClientBuilder {
     Client::builder()
         .kme_url(sae.kme_url())
@@ -307,13 +307,13 @@ pub(super) fn client_builder(sae: &Sae) -> ClientBuilder {
 }
 
 impl Sae {
-    /// Settings of a client that acts as this SAE.
+    /// Returns a builder for a client that acts as this SAE.
     pub fn client_builder(&self) -> ClientBuilder {
         client_builder(self)
     }
 }
 
-/// One KME that runs.
+/// A running KME.
 pub struct Kme {
     url: String,
     addr: SocketAddr,
@@ -322,52 +322,52 @@ pub struct Kme {
 }
 
 impl Kme {
-    /// Its ID.
+    /// Returns its ID.
     #[must_use]
     pub fn id(&self) -> &str {
         &self.state.id
     }
 
-    /// `https://address:port`.
+    /// Returns its URL, `https://address:port`.
     #[must_use]
     pub fn url(&self) -> &str {
         &self.url
     }
 
-    /// Where it listens.
+    /// Returns the address on which it listens.
     #[must_use]
     pub fn addr(&self) -> SocketAddr {
         self.addr
     }
 
-    /// What it has done so far.
+    /// Returns its counters.
     #[must_use]
     pub fn counters(&self) -> Counters {
         *lock(&self.state.counters)
     }
 
-    /// Lets the next `times` requests (or connections) meet a fault, after those injected before.
+    /// Injects a fault into the next `times` requests (or connections), after the faults injected before.
     pub fn inject(&self, fault: Fault, times: u32) {
         self.plan(FaultPlan::new(fault).times(times));
     }
 
-    /// Lets a fault happen as the plan says, after those that were there before.
+    /// Adds a fault that happens according to the plan, after the existing ones.
     pub fn plan(&self, plan: FaultPlan) {
         self.state.faults().push(plan);
     }
 
-    /// The faults that may still happen.
+    /// Returns the faults that may still happen.
     #[must_use]
     pub fn plans(&self) -> Vec<FaultPlan> {
         self.state.faults().iter().cloned().collect()
     }
 
-    /// Forgets all faults.
+    /// Removes all faults.
     pub fn clear_faults(&self) {
         self.state.faults().clear();
     }
 
-    /// Ends it: its socket and connections are closed.
+    /// Stops it: closes its socket and connections.
     pub fn stop(&self) {
         self.task.abort();
     }
@@ -379,25 +379,25 @@ impl Drop for Kme {
     }
 }
 
-/// Counts of one KME since its start.
+/// The counters of one KME since its start.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Counters {
-    /// Calls of `status`.
+    /// Number of calls of `status`.
     pub status_calls: u64,
-    /// Calls of `enc_keys`.
+    /// Number of calls of `enc_keys`.
     pub enc_keys_calls: u64,
-    /// Calls of `dec_keys`.
+    /// Number of calls of `dec_keys`.
     pub dec_keys_calls: u64,
-    /// Keys given by `enc_keys`.
+    /// Number of keys given by `enc_keys`.
     pub keys_to_masters: u64,
-    /// Keys given by `dec_keys`.
+    /// Number of keys given by `dec_keys`.
     pub keys_to_slaves: u64,
-    /// Requests answered with a status other than 200.
+    /// Number of requests answered with a status other than 200.
     pub refused: u64,
 }
 
-/// What all KMEs of a network share.
+/// The state that all KMEs of a network share.
 pub(super) struct NetworkShared {
     store: Mutex<Store>,
     layout: Layout,
@@ -410,7 +410,7 @@ impl NetworkShared {
         lock(&self.store)
     }
 
-    /// Index of the KME that an SAE is attached to.
+    /// Returns the index of the KME to which an SAE is attached.
     pub(super) fn site_of(&self, sae: &str) -> Option<usize> {
         self.layout.sites.iter().position(|site| site.saes.iter().any(|id| id == sae))
     }
@@ -420,14 +420,14 @@ impl NetworkShared {
     }
 }
 
-/// What belongs to one KME.
+/// The state of one KME.
 pub(super) struct KmeState {
     pub(super) id: String,
     pub(super) index: usize,
     pub(super) saes: BTreeSet<String>,
     counters: Mutex<Counters>,
     faults: Mutex<Faults>,
-    /// Of the last key that it gave a master.
+    /// The key_ID of the last key that it gave to a master.
     last_key_id: Mutex<Option<String>>,
 }
 
@@ -445,7 +445,7 @@ impl KmeState {
     }
 }
 
-/// Nothing here is left half changed by a panic.
+/// Locks a mutex. A panic leaves no state half changed, so poisoning is ignored.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

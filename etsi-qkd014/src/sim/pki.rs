@@ -21,9 +21,9 @@ use super::Error;
 pub struct Site {
     /// The KME's ID.
     pub kme: String,
-    /// Where it listens.
+    /// The address on which it listens.
     pub bind: SocketAddr,
-    /// IDs of its SAEs.
+    /// The IDs of its SAEs.
     pub saes: Vec<String>,
 }
 
@@ -62,13 +62,13 @@ impl Layout {
     }
 }
 
-/// A certificate and its key, PEM.
+/// A certificate and its key, in PEM.
 pub(super) struct Pair {
     pub(super) cert: String,
     pub(super) key: Zeroizing<String>,
 }
 
-/// When a certificate is valid.
+/// The validity period of a certificate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Validity {
     Now,
@@ -76,13 +76,13 @@ pub(super) enum Validity {
     Past,
 }
 
-/// What is put after a KME's ID for its certificates that are not valid now.
+/// The suffixes of a KME's ID for its certificates that are not valid now.
 const ENDINGS: [&str; 2] = [".not-yet-valid", ".expired"];
 
 impl Validity {
     const ALL: [Self; 3] = [Self::Now, Self::Future, Self::Past];
 
-    /// The name of a certificate, in files and here.
+    /// Returns the name of a certificate, which is also its file name.
     fn name(self, id: &str) -> String {
         match self {
             Self::Now => id.to_owned(),
@@ -92,26 +92,26 @@ impl Validity {
     }
 }
 
-/// The certificates of a network. The CA's key exists only as long as the `Pki` that made it.
+/// The certificates of a network. The CA's key exists only as long as the `Pki` that created it.
 pub struct Pki {
     ca: String,
     issuer: Option<Issuer<'static, KeyPair>>,
-    /// By name; see [`Validity::name`].
+    /// The certificates by name; see [`Validity::name`].
     pairs: BTreeMap<String, Pair>,
 }
 
 impl Pki {
-    /// Makes a CA and a certificate for each KME and SAE, and for each KME one that has expired and
-    /// one of the future.
+    /// Creates a CA and a certificate for each KME and SAE. Each KME also gets an expired
+    /// certificate and one that is not valid yet.
     ///
     /// # Errors
-    /// [`Error::Layout`] where the layout is unusable.
+    /// [`Error::Layout`] if the layout is unusable.
     pub fn create(layout: &Layout) -> Result<Self, Error> {
         layout.check()?;
         let key = KeyPair::generate().map_err(cert_error)?;
         let mut params = CertificateParams::default();
         params.distinguished_name = rcgen::DistinguishedName::new();
-        // A name of its own, so that a certificate of another run's CA is told as such.
+        // A unique name, so that a certificate of another run's CA is recognized as such.
         let name = format!("kme-sim throw-away CA {}", super::store::uuid());
         params.distinguished_name.push(DnType::CommonName, name);
         params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
@@ -132,7 +132,7 @@ impl Pki {
         Ok(pki)
     }
 
-    /// Reads what [`write`](Self::write) wrote. No further certificate can be issued by it.
+    /// Reads the files that [`write`](Self::write) wrote. It cannot issue further certificates.
     ///
     /// # Errors
     /// [`Error::Io`] names the file that cannot be read.
@@ -155,8 +155,9 @@ impl Pki {
     }
 
     /// Writes `ca.pem`, and `ID.crt` and `ID.key` (mode 0600) of each KME and SAE, into `dir`,
-    /// which is made if need be (mode 0700). Of each KME also `ID.expired` and `ID.not-yet-valid`,
-    /// which it shows as a [fault](super::Fault::CertificateExpired), or another server can.
+    /// which is created (mode 0700) if necessary. Also writes `ID.expired` and `ID.not-yet-valid`
+    /// of each KME, which the KME shows as a [fault](super::Fault::CertificateExpired), or another
+    /// server may show.
     ///
     /// # Errors
     /// [`Error::Io`] names the file that cannot be written.
@@ -174,7 +175,7 @@ impl Pki {
         Ok(())
     }
 
-    /// The CA's certificate, PEM.
+    /// Returns the CA's certificate in PEM.
     #[must_use]
     pub fn ca_pem(&self) -> &str {
         &self.ca
@@ -185,7 +186,7 @@ impl Pki {
         pair.ok_or_else(|| Error::Certificates(format!("none was made for {id:?}")))
     }
 
-    /// A server certificate where `server` names its address, else a client certificate.
+    /// Issues a server certificate for the address `server`, or a client certificate without it.
     pub(super) fn issue(
         &self,
         id: &str,
@@ -209,7 +210,7 @@ impl Pki {
             params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ServerAuth];
             params.subject_alt_names = vec![SanType::IpAddress(ip)];
             for name in [id, "localhost"] {
-                // An ID with an underscore is no host name, and then stands in the subject alone.
+                // An ID with an underscore is no host name, so it is only in the subject.
                 if !name.contains('_') {
                     let name = name.try_into().map_err(cert_error)?;
                     params.subject_alt_names.push(SanType::DnsName(name));
@@ -242,7 +243,7 @@ fn make_dir(dir: &Path) -> std::io::Result<()> {
     builder.create(dir)
 }
 
-/// Writes a new file. An old one is replaced, never written into: its mode might be wider.
+/// Writes a new file. An old file is replaced, never written into, because its mode might be wider.
 pub(super) fn write_file(path: &Path, text: &str, secret: bool) -> std::io::Result<()> {
     match fs::remove_file(path) {
         Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(e),
@@ -257,7 +258,7 @@ pub(super) fn write_file(path: &Path, text: &str, secret: bool) -> std::io::Resu
     options.open(path)?.write_all(text.as_bytes())
 }
 
-/// What an SAE needs to call its KME.
+/// The data with which an SAE calls its KME.
 pub struct Sae {
     pub(super) id: String,
     pub(super) kme_id: String,
@@ -267,44 +268,44 @@ pub struct Sae {
 }
 
 impl Sae {
-    /// The SAE's ID.
+    /// Returns the SAE's ID.
     #[must_use]
     pub fn id(&self) -> &str {
         &self.id
     }
 
-    /// ID of its KME.
+    /// Returns the ID of its KME.
     #[must_use]
     pub fn kme_id(&self) -> &str {
         &self.kme_id
     }
 
-    /// URL of its KME.
+    /// Returns the URL of its KME.
     #[must_use]
     pub fn kme_url(&self) -> &str {
         &self.kme_url
     }
 
-    /// The network's CA, PEM.
+    /// Returns the network's CA in PEM.
     #[must_use]
     pub fn ca_pem(&self) -> &str {
         &self.ca
     }
 
-    /// Its certificate, PEM.
+    /// Returns its certificate in PEM.
     #[must_use]
     pub fn cert_pem(&self) -> &str {
         &self.pair.cert
     }
 
-    /// Its private key, PEM.
+    /// Returns its private key in PEM.
     #[must_use]
     pub fn key_pem(&self) -> &str {
         &self.pair.key
     }
 
-    /// The environment that tells a program to be this SAE, with the files that
-    /// [`Network::write_files`](super::Network::write_files) puts into `dir`.
+    /// Returns the environment that makes a program act as this SAE, with the files that
+    /// [`Network::write_files`](super::Network::write_files) writes into `dir`.
     #[must_use]
     pub fn env(&self, dir: &Path) -> Vec<(&'static str, String)> {
         env(&self.id, &self.kme_id, &self.kme_url, dir)
@@ -324,7 +325,7 @@ pub(super) fn env(sae: &str, kme: &str, url: &str, dir: &Path) -> Vec<(&'static 
 }
 
 impl Layout {
-    /// The environment of each SAE, with the files that [`Pki::write`] puts into `dir`.
+    /// Returns the environment of each SAE, with the files that [`Pki::write`] writes into `dir`.
     #[must_use]
     pub fn env(&self, dir: &Path) -> Vec<(String, Vec<(&'static str, String)>)> {
         let of = |site: &Site, sae: &String| {

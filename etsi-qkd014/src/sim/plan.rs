@@ -1,4 +1,5 @@
-//! When a fault happens: to whom, how often, how likely; and the faults that wait at a KME.
+//! Plans for faults: for which requests, how often and how likely they happen. Also the queue of
+//! plans at a KME.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -32,10 +33,10 @@ impl Method {
     }
 }
 
-/// A [`Fault`] and when it happens. By default always, until it is cleared.
+/// A [`Fault`] with the conditions for it. By default it always happens, until it is cleared.
 ///
-/// As text: the fault, then any of `times=N`, `probability=P` and `on=METHOD`, with commas:
-/// `cut,times=2,on=dec_keys`.
+/// Its text is the fault, then any of `times=N`, `probability=P` and `on=METHOD`, separated by
+/// commas: `cut,times=2,on=dec_keys`.
 ///
 /// ```
 /// use etsi_qkd014::sim::{Fault, FaultPlan, Method};
@@ -52,36 +53,36 @@ pub struct FaultPlan {
 }
 
 impl FaultPlan {
-    /// A fault that happens until it is cleared.
+    /// Creates a plan for a fault that happens until it is cleared.
     #[must_use]
     pub fn new(fault: Fault) -> Self {
         Self { fault, times: None, probability: 1.0, on: None }
     }
 
-    /// Only so many times.
+    /// Limits the number of times.
     #[must_use]
     pub fn times(mut self, times: u32) -> Self {
         self.times = Some(times);
         self
     }
 
-    /// Each time with this probability, 0 to 1; a value outside, or NaN, is read as the nearer end
-    /// (NaN as 0).
+    /// Sets the probability for each time, 0 to 1. A value outside becomes the nearer limit, and
+    /// NaN becomes 0.
     #[must_use]
     pub fn probability(mut self, probability: f64) -> Self {
         self.probability = if probability.is_nan() { 0.0 } else { probability.clamp(0.0, 1.0) };
         self
     }
 
-    /// Only requests of this method. A fault of connections happens before the method is known,
-    /// and does not look at it.
+    /// Limits the fault to requests of this method. A fault of connections ignores it, because it
+    /// happens before the method is known.
     #[must_use]
     pub fn on(mut self, method: Method) -> Self {
         self.on = Some(method);
         self
     }
 
-    /// The fault.
+    /// Returns the fault.
     #[must_use]
     pub fn fault(&self) -> &Fault {
         &self.fault
@@ -104,7 +105,7 @@ impl fmt::Display for FaultPlan {
 impl FromStr for FaultPlan {
     type Err = String;
 
-    /// The error says what was read and what is accepted.
+    /// Parses a plan. The error contains the text and the accepted values.
     fn from_str(text: &str) -> Result<Self, String> {
         let mut parts = text.split(',');
         let mut plan = Self::new(parts.next().unwrap_or_default().parse()?);
@@ -143,14 +144,14 @@ impl FromStr for FaultPlan {
     }
 }
 
-/// What a request meets.
+/// The faults that affect a request.
 #[derive(Debug, Default, PartialEq)]
 pub(super) struct Met {
     pub(super) delay: Duration,
     pub(super) fault: Option<Fault>,
 }
 
-/// Faults that wait at a KME. The first that fits happens.
+/// The plans that wait at a KME. The first that matches is applied.
 #[derive(Debug, Default)]
 pub(super) struct Faults(VecDeque<FaultPlan>);
 
@@ -169,12 +170,12 @@ impl Faults {
         self.0.iter()
     }
 
-    /// The fault for a new connection.
+    /// Returns the fault for a new connection.
     pub(super) fn for_connection(&mut self) -> Option<Fault> {
         self.take(|plan| plan.fault.meets() == Meets::Connection)
     }
 
-    /// What a request of `method` meets; `None` where the request names no method.
+    /// Returns the faults for a request of `method`; `None` if the request names no method.
     pub(super) fn for_request(&mut self, method: Option<Method>) -> Met {
         let fits = |plan: &FaultPlan| {
             plan.fault.meets() == Meets::Request && (plan.on.is_none() || plan.on == method)
@@ -201,7 +202,7 @@ impl Faults {
 
 fn happens(probability: f64) -> bool {
     let mut bytes = [0; 4];
-    // Without randomness everything is said to happen; keys could not be made either.
+    // Without randomness every fault happens; keys could not be made either.
     let _ = tls::provider().secure_random.fill(&mut bytes);
     f64::from(u32::from_le_bytes(bytes)) < probability * (f64::from(u32::MAX) + 1.0)
 }
@@ -266,7 +267,7 @@ mod tests {
         let mut faults = Faults::default();
         faults.push(FaultPlan::new(Fault::CutAnswer).probability(0.5));
         let hits = (0..4000).filter(|_| faults.for_request(None).fault.is_some()).count();
-        // Ten standard deviations.
+        // Within ten standard deviations.
         assert!((1684..=2316).contains(&hits), "{hits}");
         faults.clear();
         faults.push(FaultPlan::new(Fault::CutAnswer).probability(f64::NAN));

@@ -1,4 +1,4 @@
-//! The sockets: TLS in front of [`http`](super::http) and [`api`](super::api).
+//! The sockets: TLS for [`http`](super::http) and [`api`](super::api).
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -20,16 +20,16 @@ use super::http::{self, Answer, NoRequest};
 use super::network::{KmeState, NetworkShared};
 use crate::subject;
 
-/// Open connections of one KME.
+/// Most open connections of one KME.
 const MAX_CONNECTIONS: usize = 1024;
-/// Time for a handshake where others wait for a place.
+/// Time for a handshake while other connections wait for a place.
 const HANDSHAKE_TIMEOUT_WHEN_FULL: Duration = Duration::from_secs(1);
-/// Time for a request to come whole, and for its answer to be taken.
+/// Time for a complete request to arrive, and for its answer to be read.
 const IDLE_TIME: Duration = Duration::from_secs(60);
-/// Bytes of further requests that are taken in before an answer has gone out.
+/// Bytes of further requests that are read before an answer has been sent.
 const MAX_AHEAD: usize = 64 << 10;
 
-/// Serves until it is aborted, and takes its connections with it then.
+/// Serves until it is aborted, which also ends its connections.
 pub(super) async fn serve(
     listener: TcpListener,
     acceptors: Acceptors,
@@ -42,7 +42,7 @@ pub(super) async fn serve(
     loop {
         while connections.try_join_next().is_some() {}
         let Ok((stream, _)) = listener.accept().await else {
-            // Most likely no more files may be open.
+            // Most likely the limit on open files is reached.
             strangers.turn_away_old();
             tokio::time::sleep(Duration::from_millis(50)).await;
             continue;
@@ -58,7 +58,7 @@ pub(super) async fn serve(
             let (shared, kme, known) = (Arc::clone(&shared), Arc::clone(&kme), Arc::clone(&known));
             connections.spawn(async move {
                 let _place = place;
-                // A client that breaks off is its own business.
+                // A client that breaks off affects only itself.
                 let _ = match fault {
                     Some(Fault::HandshakeRefused) => refuse(stream).await,
                     _ => connection(stream, &acceptor, &known, &shared, &kme).await,
@@ -69,9 +69,8 @@ pub(super) async fn serve(
     }
 }
 
-/// Connections that have not proved who they are, oldest first. Where all places are taken, one of
-/// them gives way after [`HANDSHAKE_TIMEOUT_WHEN_FULL`], so that a peer without a certificate does not block others for
-/// long.
+/// Connections that are not authenticated, oldest first. If all places are taken, one of them is closed after
+/// [`HANDSHAKE_TIMEOUT_WHEN_FULL`], so that a peer without a certificate does not block others for long.
 #[derive(Default)]
 struct Strangers(VecDeque<Stranger>);
 
@@ -111,7 +110,7 @@ impl Strangers {
         }
     }
 
-    /// A place for one more connection.
+    /// Waits for a place for one more connection.
     async fn make_room(&mut self, places: &Arc<Semaphore>) -> Option<OwnedSemaphorePermit> {
         if let Ok(place) = Arc::clone(places).try_acquire_owned() {
             return Some(place);
@@ -124,7 +123,7 @@ impl Strangers {
                 place = &mut place => return place.ok(),
                 () = sleep_until(oldest.since + HANDSHAKE_TIMEOUT_WHEN_FULL) => oldest.task.abort(),
             }
-            // It is gone, even if its task does not say so yet.
+            // The connection has ended, even if its task has not ended yet.
             self.0.pop_front();
         }
         place.await.ok()
@@ -180,7 +179,7 @@ async fn connection(
         }
         let write = http::write(&mut stream, &answer, fault.as_ref());
         let stays = match fault {
-            // A client that takes nothing does not stay for ever.
+            // A client that reads nothing must not stay for ever.
             None => timeout(IDLE_TIME, write).await.unwrap_or(Ok(false))?,
             Some(_) => write.await?,
         };
@@ -193,8 +192,8 @@ async fn connection(
     }
 }
 
-/// Waits before an answer. Returns whether the client is still there: one that is gone would take
-/// a place until the time is over.
+/// Waits before an answer. Returns whether the client is still there: a client that is gone would occupy a place until
+/// the time is over.
 async fn delay(stream: &mut TlsStream<TcpStream>, buffer: &mut Vec<u8>, time: Duration) -> bool {
     let until = Instant::now() + time;
     while buffer.len() < MAX_AHEAD {
@@ -215,8 +214,7 @@ async fn delay(stream: &mut TlsStream<TcpStream>, buffer: &mut Vec<u8>, time: Du
 mod tests {
     use super::*;
 
-    /// Connections that never end, of which the first has proved who it is. The clock goes on where
-    /// all wait.
+    /// The connections never end, and the first is authenticated. The simulated clock advances when all tasks wait.
     #[tokio::test(start_paused = true)]
     async fn unauthenticated_connections_give_way_in_turn_and_authenticated_connections_stay() {
         const PLACES: usize = 4;
@@ -235,7 +233,7 @@ mod tests {
             handles.push(task.clone());
             strangers.add(task, Arc::new(AtomicBool::new(number == 0)));
         }
-        // Sixteen too many, three at a time.
+        // There are sixteen too many, and three are closed at a time.
         assert!(
             began.elapsed() >= HANDSHAKE_TIMEOUT_WHEN_FULL * 6
                 && began.elapsed() < HANDSHAKE_TIMEOUT_WHEN_FULL * 7

@@ -1,4 +1,4 @@
-//! Key material that the KMEs of a network share: what a QKD link would have put into both.
+//! The key material that the KMEs of a network share, in place of a QKD link.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::fmt;
@@ -15,31 +15,31 @@ use crate::tls;
 pub enum FillRate {
     /// The store is always full.
     Unlimited,
-    /// So many keys of the default size a second.
+    /// This number of keys of the default size per second.
     PerSecond(f64),
 }
 
-/// Keys given to a master and not yet to all slaves, at most; the oldest is wiped beyond it.
+/// Most keys that a master has and not all slaves; beyond it, the oldest is deleted.
 const MAX_WAITING: usize = 65_536;
 
 pub(super) struct Store {
     rate: FillRate,
     max_stored: u64,
-    /// Keys in stock for each pair of KMEs, and when that was so.
+    /// The keys in stock for each pair of KMEs, and the time of that count.
     links: HashMap<(usize, usize), (f64, Instant)>,
     initially: u64,
     waiting: HashMap<String, Waiting>,
-    /// The IDs of `waiting`, in order of their drawing.
+    /// The IDs of `waiting`, in the order in which they were drawn.
     order: BTreeMap<u64, String>,
     drawn: u64,
-    /// What was drawn since the state was noted, where it was.
+    /// The keys drawn since the state was recorded, if it was.
     noted: Option<Vec<Noted>>,
-    /// What is drawn again, the oldest first.
+    /// The keys that are drawn again, the oldest first.
     again: VecDeque<Noted>,
     witness: Witness,
 }
 
-/// Is told of each key that is drawn: its key_ID and the key.
+/// A function that gets the key_ID and the secret of each key that is drawn.
 #[derive(Clone, Default)]
 pub(super) struct Witness(Option<Arc<Tell>>);
 
@@ -57,7 +57,7 @@ impl fmt::Debug for Witness {
     }
 }
 
-/// A key as it was drawn.
+/// A key as it was drawn, with its master and slaves.
 struct Noted {
     key: Drawn,
     master: String,
@@ -66,7 +66,7 @@ struct Noted {
 
 /// A key that slaves may still draw.
 struct Waiting {
-    /// Its place in the order of drawing.
+    /// Its number in the order of drawing.
     place: u64,
     secret: Zeroizing<Vec<u8>>,
     master: String,
@@ -75,12 +75,12 @@ struct Waiting {
 
 pub(super) type Drawn = (String, Zeroizing<Vec<u8>>);
 
-/// Why keys are not given to a slave.
+/// The reason why keys are not given to a slave.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Refusal {
-    /// No such key, or this slave has had it.
+    /// There is no such key, or this slave has had it.
     Unknown(Vec<String>),
-    /// The key exists and is not for this pair of master and slave.
+    /// The key exists but is not for this pair of master and slave.
     NotYours,
 }
 
@@ -104,18 +104,18 @@ impl Store {
         Self { witness, ..self }
     }
 
-    /// Notes its state, to be set back to.
+    /// Records the state, for [`set_back`](Self::set_back).
     pub(super) fn note(&mut self) {
         self.noted = Some(Vec::new());
         self.again.clear();
     }
 
-    /// Goes back to the state that was noted: what was drawn since is drawn again.
+    /// Restores the recorded state: the keys drawn since then are drawn again.
     pub(super) fn set_back(&mut self) {
         self.again.extend(self.noted.replace(Vec::new()).unwrap_or_default());
     }
 
-    /// The key that comes next for `master` and `slaves`.
+    /// Returns the next key for `master` and `slaves`.
     fn next_key(&mut self, bytes: usize, master: &str, slaves: &BTreeSet<String>) -> Drawn {
         let fits = |noted: &Noted| {
             noted.master == master && noted.slaves == *slaves && noted.key.1.len() == bytes
@@ -136,7 +136,7 @@ impl Store {
         key
     }
 
-    /// Keys in stock between two KMEs now.
+    /// Returns the number of keys in stock between two KMEs now.
     pub(super) fn stored(&mut self, a: usize, b: usize) -> u64 {
         *self.level(a, b) as u64
     }
@@ -154,8 +154,8 @@ impl Store {
         level
     }
 
-    /// Draws `number` fresh keys of `bytes` each, at `cost` of the stock of every link that carries
-    /// them; `None` where one does not hold that much, and then none is spent.
+    /// Draws `number` fresh keys of `bytes` each, at `cost` from the stock of every link that
+    /// carries them. Returns `None`, and spends nothing, if one link does not have that much.
     pub(super) fn draw(
         &mut self,
         links: &BTreeSet<(usize, usize)>,
@@ -192,7 +192,8 @@ impl Store {
         Some(drawn)
     }
 
-    /// Gives keys to a slave, each once unless it is to `keep` them; all of them or none.
+    /// Gives keys to a slave, each once unless they are to be kept (`keep`). Gives either all of
+    /// them or none.
     pub(super) fn give(
         &mut self,
         ids: &[String],
@@ -235,7 +236,7 @@ fn random(bytes: &mut [u8]) {
     tls::provider().secure_random.fill(bytes).expect("the system's random number generator works");
 }
 
-/// A random UUID, version 4 (RFC 9562, 5.4).
+/// Returns a random UUID, version 4 (RFC 9562, 5.4).
 pub(super) fn uuid() -> String {
     let mut bytes = [0; 16];
     random(&mut bytes);
@@ -290,7 +291,7 @@ mod tests {
     fn delivered_keys_leave_no_entries() {
         let mut store = Store::new(FillRate::Unlimited, 10, 10);
         let first = store.draw(&link(0, 1), 1, 32, 1, "m", &slaves(&["s"])).unwrap();
-        // More than may wait, but none of them does.
+        // More keys than may wait, but none of these waits.
         for _ in 0..MAX_WAITING / 64 + 1 {
             let drawn = store.draw(&link(0, 1), 64, 32, 1, "m", &slaves(&["s", "t"])).unwrap();
             let ids: Vec<_> = drawn.into_iter().map(|(id, _)| id).collect();

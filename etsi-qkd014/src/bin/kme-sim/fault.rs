@@ -71,7 +71,7 @@ pub(crate) fn fault(arguments: &Arguments) -> CommandResult {
     Ok(())
 }
 
-/// The resource of a KME's faults. Its ID goes into a request line.
+/// Returns the URL of a KME's faults. The KME's ID becomes part of a request line.
 fn of(kme: &str) -> CommandResult<String> {
     if kme.is_empty() || !kme.bytes().all(|c| c.is_ascii_alphanumeric() || b"-_.".contains(&c)) {
         return Err(CommandFailure::Usage(format!("{kme:?} is no KME's ID")));
@@ -79,7 +79,7 @@ fn of(kme: &str) -> CommandResult<String> {
     Ok(format!("/faults/{kme}"))
 }
 
-/// One request on a connection of its own, which the other end closes.
+/// Makes one request on its own connection, which the other end closes.
 fn call(
     to: SocketAddr,
     method: &str,

@@ -62,7 +62,7 @@ pub(crate) fn init(arguments: &Arguments) -> CommandResult {
     Ok(())
 }
 
-/// A file of an earlier run that would be replaced. A dangling link is one, too.
+/// Returns a file of an earlier run that would be replaced. A dangling link counts as one.
 fn present(dir: &Path, layout: &Layout) -> Option<PathBuf> {
     let ids = layout.sites.iter().flat_map(|site| site.saes.iter().chain([&site.kme]));
     let pairs = ids.flat_map(|id| [format!("{id}.crt"), format!("{id}.key")]);

@@ -29,7 +29,7 @@ enum Command {
     Probe(probe::Arguments),
 }
 
-/// Why the program ends without success.
+/// The reason why the program ends without success.
 enum CommandFailure {
     Usage(String),
     Other(String),
@@ -66,7 +66,7 @@ fn other(error: impl std::fmt::Display) -> CommandFailure {
     CommandFailure::Other(error.to_string())
 }
 
-/// Where `init` leaves the layout for `run`.
+/// Returns the file in which `init` leaves the layout for `run`.
 fn layout_file(dir: &Path) -> PathBuf {
     dir.join("layout.json")
 }

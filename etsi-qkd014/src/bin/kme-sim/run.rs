@@ -114,7 +114,7 @@ fn rate(text: &str) -> Result<f64, String> {
     rate.ok_or_else(|| "a number from 0 is wanted".to_owned())
 }
 
-/// `KME:PLAN`
+/// Parses `KME:PLAN`.
 fn fault(text: &str) -> Result<(String, FaultPlan), String> {
     let (id, plan) = text.split_once(':').ok_or("KME:PLAN is wanted")?;
     Ok((id.to_owned(), plan.parse()?))

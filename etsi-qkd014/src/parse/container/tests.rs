@@ -76,7 +76,7 @@ fn an_id_that_is_no_uuid_needs_its_quirk() {
 #[test]
 fn keys_of_another_size_are_refused() {
     assert!(matches!(refused(&changed("/keys/1/key", json!("AAAA"))), Error::Check { .. }));
-    // With no size asked they must at least agree with each other.
+    // If no size was requested, the keys must at least have the same size.
     let unequal = changed("/keys/1/key", json!("AAAA"));
     assert!(parse(&unequal, &Asked::Number(2), None).is_err());
     assert!(parse(&two(), &Asked::Number(2), Some(128)).is_err());
@@ -188,7 +188,7 @@ fn a_repeated_id_is_found_among_such_as_begin_alike() {
     ids.push(ids[0x2b].to_ascii_uppercase());
     let found = repeated(ids.iter().map(String::as_str)).unwrap();
     assert!(found.eq_ignore_ascii_case(&ids[0x2b]), "{found}");
-    // Short ones too, of which one begins another.
+    // Also short IDs, of which one is a prefix of another.
     assert_eq!(repeated(["k", "key-1", "key-10", "key-100000", "key-10000"].into_iter()), None);
     assert_eq!(repeated(["k", "key-1", "K"].into_iter()), Some("k"));
 }
@@ -218,7 +218,7 @@ fn no_answer_is_shorter_than_its_least_length() {
     }
 }
 
-/// A key_ID and, as its key, the same number.
+/// Returns a key_ID, and the same number as its key.
 fn numbered(number: u8, upper: bool) -> (String, Value) {
     let id = format!("{number:02x}490419-7d60-487f-adc1-4ddcc177c139");
     let shown = if upper { id.to_ascii_uppercase() } else { id.clone() };
@@ -240,7 +240,7 @@ proptest! {
             prop_assert_eq!(key.key_id(), id);
             prop_assert_eq!(key.expose_secret(), &[*number; 4]);
         }
-        // One of them in another's place.
+        // One key replaces another.
         let mut other = came;
         other[7]["key_ID"] = json!(ID_2);
         let strange = parse(&json!({ "keys": other }), &Asked::Ids(&ids), Some(32));

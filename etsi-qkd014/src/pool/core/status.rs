@@ -1,15 +1,15 @@
-//! How a pool stands, and what it knows of its KME's stock.
+//! The state of a pool, and what it knows of its KME's stock.
 
 use std::time::Duration;
 
 use crate::Status;
 
-/// The part of the KME's status that a pool depends on.
+/// The part of the KME's status that a pool uses.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Stock {
-    /// Keys that the KME stores; 0: unknown.
+    /// Number of keys that the KME stores; 0 if unknown.
     pub stored_key_count: u64,
-    /// Most keys that a call may ask for; 0: unknown.
+    /// Most keys that a call may ask for; 0 if unknown.
     pub max_key_per_request: u64,
 }
 
@@ -22,42 +22,44 @@ impl From<&Status> for Stock {
     }
 }
 
-/// How a pool stands.
+/// The state of a pool.
 #[derive(Clone, Debug, PartialEq)]
 #[non_exhaustive]
 pub struct PoolStatus {
-    /// Keys that can be taken now.
+    /// Number of keys that can be taken now.
     pub held: usize,
-    /// Keys asked for and not there.
+    /// Number of keys that were requested and have not come.
     pub asked: usize,
-    /// Of them those whose call takes so long that they are not counted on.
+    /// Number of those whose call takes so long that the pool does not count on them.
     pub overdue: usize,
-    /// Keys that the owner keeps ready, as it last said.
+    /// Number of keys that the owner keeps ready, as it last reported.
     pub elsewhere: usize,
-    /// Keys that should be held or asked for: what was set, within the KME's stock.
+    /// Number of keys that should be held or requested: the target that was set, within the KME's
+    /// stock.
     pub target: usize,
-    /// Keys a second that the KME gives, where it was seen at its limit.
+    /// Keys per second that the KME gives, if it was seen at its limit.
     pub supply: Option<f64>,
-    /// How long keys have been wanted without any coming. See [`is_stalled`](Self::is_stalled).
+    /// Time for which keys have been wanted without any coming. See
+    /// [`is_stalled`](Self::is_stalled).
     pub waiting: Option<Duration>,
-    /// Failed calls for keys since the last one that gave some.
+    /// Number of failed calls for keys since the last one that gave some.
     pub failures: u32,
-    /// Keys that came and could be taken.
+    /// Number of usable keys that came.
     pub obtained: u64,
-    /// Keys put in by the owner.
+    /// Number of keys that the owner put in.
     pub put: u64,
-    /// Keys taken.
+    /// Number of keys taken.
     pub taken: u64,
-    /// Keys dropped because nobody took them in time.
+    /// Number of keys dropped because nobody took them in time.
     pub expired: u64,
-    /// Keys that came and were refused, as under a key_ID that was there before.
+    /// Number of keys that came and were refused, for example because of a known key_ID.
     pub unusable: u64,
-    /// What the KME last said of its stock.
+    /// The KME's stock as last reported.
     pub stock: Option<Stock>,
 }
 
 impl PoolStatus {
-    /// Whether keys have been wanted for a second or more and none came.
+    /// Returns whether keys have been wanted for a second or more and none came.
     #[must_use]
     pub fn is_stalled(&self) -> bool {
         self.waiting.is_some_and(|time| time >= Duration::from_secs(1))

@@ -1,4 +1,4 @@
-//! The rules under a clock of the test's own, hostile orders of events first.
+//! Tests the rules with a simulated clock, in particular with hostile orders of events.
 
 use proptest::prelude::*;
 
@@ -12,7 +12,7 @@ fn stock(stored_key_count: u64, max_key_per_request: u64) -> Stock {
     Stock { stored_key_count, max_key_per_request }
 }
 
-/// A pool with a target whose KME has told its stock.
+/// Creates a pool with a target, whose KME has reported its stock.
 fn core(target: usize, stock: Stock) -> Core<u32> {
     let mut core = Core::new(Settings { target, ..Settings::default() }, || 255);
     assert_eq!(core.poll(ms(0)), Some(Ask::Status));
@@ -27,12 +27,12 @@ fn asks(core: &mut Core<u32>, now: Duration) -> Vec<Ask> {
 #[derive(Clone, Debug)]
 enum Event {
     Pass(u64),
-    /// The call in flight at this place gives so many of its keys.
+    /// The call in flight at this index returns this number of its keys.
     Keys(usize, u32),
     Fail(usize, FailureClass),
     Stock(u64, u64),
     Take,
-    /// The key taken last comes back, so many milliseconds older than it is.
+    /// The key that was taken last is put back, this number of milliseconds older than it is.
     Put(u64),
     Target(usize),
     Elsewhere(usize),
@@ -77,7 +77,7 @@ proptest! {
         let mut last_stock: Option<Stock> = None;
         let mut flying: Vec<(u32, Duration)> = Vec::new();
         let mut status_flying = false;
-        // Each key is (number, when it was asked for).
+        // Each key is (number, time of its request).
         let mut made = 0u32;
         let mut taken = std::collections::HashSet::new();
         let (mut last_taken, mut takes, mut elsewhere) = (None, 0, 0);
@@ -86,8 +86,8 @@ proptest! {
                 Event::Pass(millis) => now += ms(millis),
                 Event::Keys(i, given) if !flying.is_empty() => {
                     let (n, _) = flying.remove(i % flying.len());
-                    // The core may have counted another call of the same size as ended: so the
-                    // age known here is the youngest possible one.
+                    // The core may have counted another call of the same size as ended, so the age
+                    // known here is the lowest possible one.
                     let keys: Vec<(u32, Duration)> =
                         (0..n.min(given)).map(|k| (made + k, now)).collect();
                     made += n;
@@ -173,11 +173,11 @@ proptest! {
                 prop_assert!(at > now, "polled out, so the next thing is later");
             }
         }
-        // It never falls asleep while keys are missing.
+        // The pool never sleeps without a timeout while keys are missing.
         if flying.is_empty() && !status_flying {
             core.set_target(1000);
             core.set_elsewhere(0);
-            // Keys may grow old before, each batch at its own time.
+            // Keys may grow too old before that, each batch at its own time.
             let asked = (0..1000).any(|_| {
                 now = core.poll_timeout().expect("something is to come").max(now);
                 core.poll(now).is_some()
@@ -239,7 +239,7 @@ fn failures_that_may_cost_keys_wait_longer_and_jitter_stays_in_the_upper_half() 
             let mut core: Core<u32> = Core::new(settings, move || jitter);
             core.poll(ms(0));
             core.on_stock(ms(0), stock(0, 0));
-            // The status calls stay out of the way: one is in flight all the time.
+            // One status call is in flight all the time, so that status calls do not interfere.
             let mut now = ms(5_000);
             assert_eq!(core.poll(now), Some(Ask::Status));
             for wait in waits {
@@ -265,7 +265,7 @@ fn a_call_that_hangs_is_not_waited_for() {
     assert_eq!(core.poll(ms(4_000)), None, "as many calls as may be");
     let status = core.status(ms(4_000));
     assert_eq!((status.asked, status.overdue), (16, 16));
-    // Those that answer after all are welcome, the oldest first.
+    // Keys of calls that answer late are accepted, the oldest first.
     core.on_keys(ms(4_100), 4, 0..4);
     assert_eq!(core.poll(ms(4_100)), None, "nothing is missing");
     core.on_keys(ms(4_200), 4, 4..8);
@@ -309,7 +309,7 @@ fn untaken_keys_are_dropped_at_their_maximum_age() {
     core.poll(ms(0));
     core.on_stock(ms(0), stock(0, 0));
     assert_eq!(core.poll(ms(0)), Some(Ask::Keys(2)));
-    // The age counts from the asking: the KME wiped them that long after.
+    // The age counts from the request, because the KME deletes the keys that long after it.
     core.on_keys(ms(400), 2, [Counted(live.clone()), Counted(live.clone())]);
     assert_eq!(core.poll_timeout(), Some(ms(1_000)));
     assert!(core.take(ms(999)).is_some_and(|key| std::sync::Arc::ptr_eq(&key.0, &live)));
@@ -387,7 +387,7 @@ fn a_refill_waits_for_a_batch_to_be_missing() {
     core.take(ms(1));
     assert!(core.wants_keys(ms(1)));
     assert_eq!(asks(&mut core, ms(1)), [Ask::Keys(4)]);
-    // One came instead of four: it asks for the rest.
+    // One key came instead of four, so the pool asks for the rest.
     core.on_keys(ms(2), 4, [16]);
     assert_eq!(asks(&mut core, ms(2)), [Ask::Keys(3)]);
 }

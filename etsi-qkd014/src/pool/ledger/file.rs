@@ -1,8 +1,7 @@
 //! A ledger in a file: a header of 32 bytes, then a SHA-256 for each key_ID.
 //!
-//! A batch is written after the last whole record and brought to stable storage before anybody may
-//! use its keys. What a crash leaves of a batch in between does no harm, whether part of it,
-//! zeros or nothing: its keys were never handed out.
+//! A batch is written after the last whole record and flushed to stable storage before its keys may be used. A crash in
+//! between may leave a part of the batch, zeros or nothing. That does no harm, because its keys were never handed out.
 
 use std::collections::HashSet;
 use std::fs::{File, OpenOptions};
@@ -15,24 +14,24 @@ use rustix::io::Errno;
 
 use super::{LedgerError, Sha, Short, short};
 
-/// As long as a record, so that no record crosses a block of the disk.
+/// As long as a record, so that no record crosses a disk block.
 const HEADER: &[u8; RECORD] = b"etsi-qkd014 ledger of key_IDs 1\n";
 const RECORD: usize = 32;
 
 pub(super) struct FileLedger {
     path: PathBuf,
     file: File,
-    /// Bytes of header and whole records that are on stable storage.
+    /// Bytes of the header and the whole records that are on stable storage.
     good: u64,
-    /// The file may hold more than `good`.
+    /// True if the file may contain more than `good` bytes.
     torn: bool,
-    /// The system failed to bring a write to stable storage. It may forget that it did, so that
-    /// another try proves nothing.
+    /// True if the system failed to flush a write to stable storage. The system may report that only once, so another
+    /// attempt proves nothing.
     broken: bool,
     seen: HashSet<Short>,
-    /// Records after which the file becomes the older one, and a new one begins.
+    /// Number of records after which the file becomes the older one and a new one begins.
     capacity: usize,
-    /// What the older file has.
+    /// The records of the older file.
     older: HashSet<Short>,
 }
 
@@ -79,7 +78,7 @@ impl FileLedger {
         Self { path, file, good: 0, torn: false, broken: false, seen, capacity, older }
     }
 
-    /// Reads the file and cuts off what is torn; `false` where it is no ledger.
+    /// Reads the file and cuts off a torn record. Returns false if the file is no ledger.
     fn load(&mut self) -> io::Result<bool> {
         let mut reader = BufReader::with_capacity(1 << 16, &self.file);
         let mut begin = Vec::with_capacity(RECORD);
@@ -88,7 +87,7 @@ impl FileLedger {
             return Ok(false);
         }
         if begin.len() < RECORD {
-            // New, or torn when it was made.
+            // The file is new, or was torn when it was created.
             self.file.write_all_at(HEADER, 0)?;
             self.file.sync_all()?;
             self.sync_directory()?;
@@ -98,13 +97,13 @@ impl FileLedger {
         let records = records(&mut reader, &mut self.seen)?;
         let good = (records + 1) * RECORD as u64;
         self.good = good;
-        // What a crash left may be in the system's memory only, also whole records.
+        // After a crash, even whole records may be only in the system's memory.
         self.file.set_len(good)?;
         self.file.sync_all()?;
         Ok(true)
     }
 
-    /// A new file's name must survive a crash too.
+    /// Flushes the directory, because the name of a new file must survive a crash, too.
     fn sync_directory(&self) -> io::Result<()> {
         let parent = self.path.parent().filter(|parent| !parent.as_os_str().is_empty());
         File::open(parent.unwrap_or(Path::new(".")))?.sync_all()
@@ -118,8 +117,8 @@ impl FileLedger {
         self.seen.contains(short) || self.older.contains(short)
     }
 
-    /// The file is full: it becomes the older one, and what was that is forgotten. Where this fails
-    /// halfway, records go on into the file under its new name, and it is tried again with the next.
+    /// Makes the full file the older one, whose records replace those of the previous older file. If this fails
+    /// halfway, records go on into the file under its new name, and the next record tries again.
     fn turn(&mut self) -> io::Result<()> {
         match std::fs::rename(&self.path, older_path(&self.path)) {
             Ok(()) => {}
@@ -155,7 +154,7 @@ impl FileLedger {
             written.map_err(|source| LedgerError::Write { path: self.path.clone(), source })?;
             self.seen.extend(batch);
             if self.seen.len() >= self.capacity {
-                // What was recorded is recorded; the file is only longer than it should be.
+                // The records are written in any case; the file is only longer than it should be.
                 let _ = self.turn();
             }
         }
@@ -168,7 +167,7 @@ impl FileLedger {
         }
         if let Err(error) = self.file.write_all_at(bytes, self.good) {
             self.torn = true;
-            // Where this fails too, it is tried again before the next write.
+            // If this fails, too, it is tried again before the next write.
             let _ = self.cut();
             return Err(error);
         }
@@ -187,7 +186,7 @@ impl FileLedger {
     }
 }
 
-/// How a file is opened that nobody else may read, and that is no link to another.
+/// Returns options to open a file that only its owner may read, and that is no symbolic link.
 fn private() -> OpenOptions {
     let mut options = OpenOptions::new();
     let flags = OFlags::NOFOLLOW | OFlags::NONBLOCK;
@@ -195,14 +194,14 @@ fn private() -> OpenOptions {
     options
 }
 
-/// Where the records are that were full before.
+/// Returns the path of the older file.
 fn older_path(path: &Path) -> PathBuf {
     let mut name = path.as_os_str().to_owned();
     name.push(".old");
     name.into()
 }
 
-/// What a full file has; nothing where there is none.
+/// Returns the records of the older file; empty if there is none.
 fn older(path: &Path) -> Result<HashSet<Short>, LedgerError> {
     let mut seen = HashSet::new();
     let read = |seen: &mut HashSet<Short>| -> io::Result<bool> {
@@ -222,7 +221,7 @@ fn older(path: &Path) -> Result<HashSet<Short>, LedgerError> {
     }
 }
 
-/// Reads whole records to the end; how many.
+/// Reads whole records to the end, and returns their number.
 fn records(reader: &mut impl Read, seen: &mut HashSet<Short>) -> io::Result<u64> {
     let mut record = [0; RECORD];
     let mut count = 0;
@@ -264,7 +263,7 @@ mod tests {
 
     #[test]
     fn a_storage_that_lost_a_write_is_not_trusted_again() {
-        // The state that a failed fdatasync leaves.
+        // The state after a failed fdatasync.
         let (_dir, path) = temp();
         let mut ledger = FileLedger::open(path, usize::MAX).unwrap();
         ledger.broken = true;
@@ -294,7 +293,7 @@ mod tests {
     fn a_bounded_ledger_remembers_the_last_of_its_capacity_over_any_restart() {
         let (dir, path) = temp();
         for first in 0..12 {
-            // Opened anew each time, for two records.
+            // Opened again for every two records.
             let ledger = Ledger::file_of(&path, 5).unwrap();
             for id in [2 * first, 2 * first + 1] {
                 assert_eq!(ledger.record([id.to_string()]).unwrap(), [true]);

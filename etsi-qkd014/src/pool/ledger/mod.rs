@@ -1,4 +1,4 @@
-//! A record of the key_IDs that were there before, so that no key is used twice.
+//! A record of the key_IDs that have occurred, so that no key is used twice.
 
 use std::collections::{HashSet, VecDeque};
 use std::fmt;
@@ -10,14 +10,14 @@ use sha2::{Digest, Sha256};
 #[cfg(unix)]
 mod file;
 
-/// Remembers key_IDs, so that a key is handed out once even where a KME repeats itself.
+/// Remembers key_IDs, so that each key is handed out once even if a KME repeats keys.
 ///
-/// A key_ID is known by the SHA-256 of its text in lower case: a KME may answer in another letter
-/// case. Nothing of a key is kept. In memory 8 bytes of each digest are looked up; two key_IDs that
-/// share them, which one pair in 2^64 does, cost a key and never let one through.
+/// A key_ID is identified by the SHA-256 of its text in lower case, because a KME may answer in another letter case.
+/// Nothing of a key is kept. In memory, 8 bytes of each digest are compared. If two key_IDs share them, which happens
+/// for one pair in 2^64, a key is lost but none is used twice.
 ///
-/// Cheap to clone, and all clones are one ledger. Pools of one KME may share a ledger; where two
-/// KMEs count their keys instead of naming them by UUIDs, each needs its own.
+/// It is cheap to clone, and all clones are the same ledger. Pools of one KME may share a ledger. If two KMEs number
+/// their keys instead of naming them by UUIDs, each needs its own ledger.
 #[derive(Clone)]
 pub struct Ledger {
     inner: Arc<Mutex<LedgerInner>>,
@@ -30,11 +30,11 @@ enum LedgerInner {
     File(file::FileLedger),
 }
 
-/// Why a ledger cannot be opened, or cannot record.
+/// The reason why a ledger cannot be opened, or cannot record.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum LedgerError {
-    /// The file cannot be opened, read, or brought into shape.
+    /// The file cannot be opened, read, or repaired.
     #[error("ledger {path}: {source}", path = path.display())]
     Open {
         /// The file.
@@ -42,15 +42,15 @@ pub enum LedgerError {
         /// The system's reason.
         source: std::io::Error,
     },
-    /// It is something else than a ledger. It was left as it is.
+    /// The file is no ledger. It was not changed.
     #[error("{path} is no ledger: {reason}; it was left as it is", path = path.display())]
     NotALedger {
         /// The file.
         path: PathBuf,
-        /// What it is.
+        /// What is wrong.
         reason: &'static str,
     },
-    /// Others than its owner may read or write it.
+    /// Other users may read or write the file.
     #[error("ledger {path} has mode {mode:o}: others could change it; chmod 600", path = path.display())]
     NotPrivate {
         /// The file.
@@ -58,7 +58,7 @@ pub enum LedgerError {
         /// Its permission bits.
         mode: u32,
     },
-    /// Another process, or another [`Ledger`] of this one, has it open.
+    /// Another process, or another [`Ledger`] of this process, has the file open.
     #[error("ledger {path} is in use by another process", path = path.display())]
     Locked {
         /// The file.
@@ -72,8 +72,7 @@ pub enum LedgerError {
         /// The system's reason.
         source: std::io::Error,
     },
-    /// The system lost a write before. Nothing is recorded any more until the ledger is opened
-    /// anew.
+    /// The system lost an earlier write. Nothing is recorded any more until the ledger is opened again.
     #[error("ledger {path}: storage failed before; open it anew once that is repaired", path = path.display())]
     Broken {
         /// The file.
@@ -81,48 +80,48 @@ pub enum LedgerError {
     },
 }
 
-/// First bytes of a digest.
+/// The first bytes of a digest.
 type Short = u64;
 type Sha = [u8; 32];
 
 impl Ledger {
-    /// Key_IDs that a ledger in memory remembers by default. About 32 bytes each: 2 MiB.
+    /// Number of key_IDs that a ledger in memory remembers by default. About 32 bytes each: 2 MiB.
     pub const DEFAULT_CAPACITY: usize = 65_536;
 
-    /// A ledger that ends with the process and remembers the last `capacity` key_IDs, at least
-    /// one; about 32 bytes each.
+    /// Creates a ledger that ends with the process and remembers the last `capacity` key_IDs, at least one. They take
+    /// about 32 bytes each.
     #[must_use]
     pub fn memory(capacity: usize) -> Self {
         let memory = Memory { capacity: capacity.max(1), ..Memory::default() };
         Self { inner: Arc::new(Mutex::new(LedgerInner::Memory(memory))), in_file: false }
     }
 
-    /// A ledger in a file, which is made (mode 0600) where there is none. It forgets nothing: 32
-    /// bytes a key in the file and about 16 in memory. Key_IDs are on stable storage before
-    /// [`record`](Self::record) returns.
+    /// Opens a ledger in a file, which is created (mode 0600) if it does not exist. It forgets nothing: each key takes
+    /// 32 bytes in the file and about 16 in memory. Key_IDs are on stable storage before [`record`](Self::record)
+    /// returns.
     ///
-    /// The file is locked (`flock`) against a second ledger on it, for as long as a clone lives. A
-    /// record that a crash tore is cut off: its key was not handed out. Blocks on the disk.
+    /// The file is locked (`flock`) against a second ledger as long as a clone lives. A record that a crash tore is cut
+    /// off: its key was not handed out. The call blocks on the disk.
     ///
     /// # Errors
-    /// [`LedgerError`]: it cannot be opened, is no ledger, is open to others, or is in use.
+    /// [`LedgerError`]: the file cannot be opened, is no ledger, is accessible to others, or is in use.
     #[cfg(unix)]
     pub fn file(path: impl Into<PathBuf>) -> Result<Self, LedgerError> {
         Self::file_of(path, usize::MAX)
     }
 
-    /// As [`file`](Self::file), and remembers the last `capacity` key_IDs at least and twice as many
-    /// at most: a full file takes the name `PATH.old`, and a new one begins.
+    /// Like [`file`](Self::file), but remembers at least the last `capacity` key_IDs and at most twice as many. A full
+    /// file gets the name `PATH.old`, and a new one begins.
     ///
     /// # Errors
-    /// [`LedgerError`], as of [`file`](Self::file), for either file.
+    /// [`LedgerError`], as for [`file`](Self::file), for either file.
     #[cfg(unix)]
     pub fn file_of(path: impl Into<PathBuf>, capacity: usize) -> Result<Self, LedgerError> {
         let file = file::FileLedger::open(path.into(), capacity)?;
         Ok(Self { inner: Arc::new(Mutex::new(LedgerInner::File(file))), in_file: true })
     }
 
-    /// Whether it remembers this key_ID. Records nothing, and does not block on a disk.
+    /// Returns whether it remembers this key_ID. Records nothing, and does not block on a disk.
     #[must_use]
     pub fn contains(&self, key_id: &str) -> bool {
         let short = short(&sha(key_id));
@@ -133,12 +132,11 @@ impl Ledger {
         }
     }
 
-    /// Records key_IDs and says of each whether it is new: only then may its key be used. All are
-    /// recorded, or none. A key_ID that is there twice is new once. With a file it blocks on the
-    /// disk, once for all.
+    /// Records key_IDs, and returns for each whether it is new: only then may its key be used. Either all are recorded
+    /// or none. A key_ID that occurs twice is new once. With a file the call blocks on the disk, once for all key_IDs.
     ///
     /// # Errors
-    /// [`LedgerError`]: nothing was recorded for certain, and none of the keys may be used.
+    /// [`LedgerError`]: it is not certain that anything was recorded, and none of the keys may be used.
     pub fn record<I>(&self, key_ids: I) -> Result<Vec<bool>, LedgerError>
     where
         I: IntoIterator<Item: AsRef<str>>,
@@ -153,7 +151,7 @@ impl Ledger {
         }
     }
 
-    /// Key_IDs that it remembers.
+    /// Returns the number of key_IDs that it remembers.
     #[must_use]
     pub fn len(&self) -> usize {
         match &*self.inner.lock().unwrap_or_else(PoisonError::into_inner) {
@@ -163,20 +161,20 @@ impl Ledger {
         }
     }
 
-    /// Whether it remembers none.
+    /// Returns whether it remembers none.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Whether [`record`](Self::record) blocks on a disk.
+    /// Returns whether [`record`](Self::record) blocks on a disk.
     pub(super) fn blocks(&self) -> bool {
         self.in_file
     }
 }
 
 impl Default for Ledger {
-    /// In memory, with [`DEFAULT_CAPACITY`](Self::DEFAULT_CAPACITY).
+    /// Creates a ledger in memory with [`DEFAULT_CAPACITY`](Self::DEFAULT_CAPACITY).
     fn default() -> Self {
         Self::memory(Self::DEFAULT_CAPACITY)
     }
@@ -192,7 +190,7 @@ impl fmt::Debug for Ledger {
 struct Memory {
     capacity: usize,
     seen: HashSet<Short>,
-    /// The oldest first.
+    /// The key_IDs, the oldest first.
     order: VecDeque<Short>,
 }
 

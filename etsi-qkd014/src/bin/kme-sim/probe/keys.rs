@@ -1,4 +1,4 @@
-//! Checks that deliver keys, and refusals that a faulty KME might answer with keys.
+//! Checks that draw keys, and refusals for which a faulty KME might deliver keys.
 
 use std::collections::BTreeSet;
 
@@ -12,10 +12,10 @@ use super::report::{Report, Verdict};
 use super::wire::{Raw, Wire};
 use crate::{CommandResult, other};
 
-/// Keys drawn in one request, at most.
+/// Most keys drawn in one request.
 const BATCH: u64 = 3;
 
-/// `enc_keys` that has to be refused.
+/// Sends `enc_keys` requests that the KME has to refuse.
 pub(super) async fn refusals(
     master: &Party,
     slave: &str,
@@ -77,7 +77,8 @@ pub(super) async fn refusals(
     Ok(())
 }
 
-/// A KME may serve any size, or say that it serves whole bytes only.
+/// Checks the answer to a size that is no multiple of 8. A KME may serve any size, or say that it
+/// serves whole bytes only.
 fn odd_size(raw: &Result<Raw, String>, report: &mut Report) {
     const WANTED: &str = "size shall be a multiple of 8";
     let expected = format!("size of broken bytes: 200, or 400 {WANTED:?}");
@@ -94,7 +95,7 @@ fn odd_size(raw: &Result<Raw, String>, report: &mut Report) {
     }
 }
 
-/// Draws keys, and where the slave is known the same keys at the other end.
+/// Draws keys, and the same keys at the other end if the slave is known.
 pub(super) async fn delivery(
     (master, slave): (&Party, Option<&Party>),
     slave_sae: &str,
@@ -130,7 +131,7 @@ pub(super) async fn delivery(
     Ok(())
 }
 
-/// One answer with keys, as the client reads it.
+/// Reports one answer with keys, as the client reads it.
 fn container(
     drawn: Result<Tolerated<KeyContainer>, Error>,
     expected: String,
@@ -169,7 +170,7 @@ fn of_all_keys(keys: &[Key], bits: u32, report: &mut Report) {
     report.check("5.3", "no key delivered twice", came, !repeated);
 }
 
-/// The form, of whatever version.
+/// Returns whether an ID has the form of a UUID of any version.
 fn is_uuid(id: &str) -> bool {
     let fits = |(at, c): (usize, u8)| match at {
         8 | 13 | 18 | 23 => c == b'-',
@@ -183,7 +184,7 @@ fn ids(keys: &[Key]) -> String {
     json!({ "key_IDs": ids.collect::<Value>() }).to_string()
 }
 
-/// An optional extension that no KME knows may be ignored, or refused in these words.
+/// Checks that an unknown optional extension is ignored, or refused with the specified message.
 async fn optional(master: &Party, slave_sae: &str, report: &mut Report) {
     const REFUSAL: &str = "not all extension_optional request options handled";
     let expected = format!("unknown extension_optional: 200, or 400 {REFUSAL:?}");
@@ -193,7 +194,7 @@ async fn optional(master: &Party, slave_sae: &str, report: &mut Report) {
         asked.extension_optional(json!({ "kmesim_optional": true })).send().await
     });
     match drawn.await {
-        // What the client tolerates in an answer is said where the keys are.
+        // The quirks that an answer needs are reported with the keys.
         Ok(_) => report.check("6.2", expected, "200", true),
         Err(error) => {
             let cause = error.cause();
@@ -203,7 +204,7 @@ async fn optional(master: &Party, slave_sae: &str, report: &mut Report) {
     }
 }
 
-/// A key is for the slaves that were named when it was drawn, and for nobody else.
+/// Checks that a key is given only to the slaves that were named when it was drawn.
 async fn not_for_the_master(
     master: &Party,
     key: &Key,
@@ -254,7 +255,7 @@ async fn fetch(
     }
 }
 
-/// The key is removed once it has been given (post-condition of clause 5.4).
+/// Checks that a key is removed once it has been given (post-condition of clause 5.4).
 async fn again(slave: &Party, master: &str, key: &Key, report: &mut Report) {
     let expected = "dec_keys of the same key again: 400";
     let Ok(client) = slave.client(quirks::lenient()) else { return };

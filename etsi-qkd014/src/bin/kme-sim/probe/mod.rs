@@ -1,4 +1,4 @@
-//! `kme-sim probe`: whether a KME holds to ETSI GS QKD 014 V1.1.1, seen from its wire.
+//! `kme-sim probe`: checks whether a KME conforms to ETSI GS QKD 014 V1.1.1, by its answers.
 
 mod keys;
 mod party;

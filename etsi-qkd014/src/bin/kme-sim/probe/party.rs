@@ -1,4 +1,4 @@
-//! An SAE to act as: where its KME is and what proves who it is.
+//! An SAE as which the probe acts: the address of its KME, and its certificate and key.
 
 use std::collections::HashMap;
 use std::fs;
@@ -11,7 +11,7 @@ use zeroize::Zeroizing;
 
 use crate::{CommandResult, other};
 
-/// Certificates and environments larger than this are none.
+/// Largest file read as a certificate or an environment, in bytes.
 const MAX_FILE: u64 = 1 << 20;
 
 pub(super) struct Party {
@@ -43,12 +43,13 @@ impl Party {
         let (ca, cert) = (read(&ca)?, read(&cert)?);
         let key = Zeroizing::new(read(&key)?);
         let party = Self { url, sae, kme_id, kme_id_only, ca, cert, key, timeout };
-        // Whatever is wrong with the settings is said before anything is sent.
+        // Errors in the settings are reported before anything is sent.
         party.client(Quirks::STRICT).map_err(other)?;
         Ok(party)
     }
 
-    /// The SAE `sae` from a file of `export NAME='value'` lines, as `kme-sim init` prints them.
+    /// Returns the SAE `sae` from a file of `export NAME='value'` lines, as `kme-sim init` prints
+    /// them.
     pub(super) fn from_env_file(file: &Path, sae: &str, timeout: Duration) -> CommandResult<Self> {
         let wrong = |why: String| other(format!("{}: {why}", file.display()));
         let text = String::from_utf8(read(file)?).map_err(|_| wrong("is not UTF-8".into()))?;
@@ -72,7 +73,7 @@ impl Party {
         })
     }
 
-    /// This crate's client. It never repeats a call: the probe counts each.
+    /// Returns this crate's client. It never repeats a call, because the probe counts each.
     pub(super) fn client(&self, quirks: Quirks) -> Result<Client, Error> {
         let mut builder = Client::builder()
             .kme_url(&self.url)
@@ -93,7 +94,7 @@ impl Party {
         builder.build()
     }
 
-    /// The URL of a method for an SAE.
+    /// Returns the URL of a method for an SAE.
     pub(super) fn method(&self, sae: &str, method: &str) -> CommandResult<Url> {
         let mut url = Url::parse(&self.url).map_err(other)?;
         url.path_segments_mut()
@@ -113,7 +114,8 @@ fn read(path: &Path) -> CommandResult<Vec<u8>> {
     fs::read(path).map_err(|e| wrong(e.to_string()))
 }
 
-/// Groups of variables; a name that comes again starts the next group. Other lines are left out.
+/// Splits the lines into groups of variables. A repeated name starts the next group. Other lines
+/// are ignored.
 fn environments(text: &str) -> Vec<HashMap<String, String>> {
     let mut all = vec![HashMap::new()];
     for line in text.lines() {
@@ -133,7 +135,7 @@ fn environments(text: &str) -> Vec<HashMap<String, String>> {
     all
 }
 
-/// Undoes the quoting of `kme-sim init`: single quotes, and `'\''` for one within.
+/// Removes the quoting of `kme-sim init`: single quotes, and `'\''` for a single quote.
 fn unquoted(value: &str) -> String {
     let inner = value.strip_prefix('\'').and_then(|rest| rest.strip_suffix('\''));
     inner.map_or_else(|| value.to_owned(), |inner| inner.replace("'\\''", "'"))

@@ -1,17 +1,17 @@
-//! Which quirks a KME needs.
+//! Finds out which quirks a KME needs.
 
 use etsi_qkd014::{Error, Quirks};
 
-/// What a call brought, and the names of the quirks that it could not do without.
+/// The result of a call, and the names of the quirks that it needs.
 pub(super) struct Tolerated<T> {
     pub(super) value: T,
     pub(super) needed: Vec<&'static str>,
 }
 
-/// Makes a call strictly, then with all quirks, then without each that it does not need. The error
-/// is that of the strict call.
+/// Makes a call strictly, then with all quirks, then without each quirk that it does not need. The
+/// error is that of the strict call.
 ///
-/// Sizes in bytes come last: that quirk changes what is asked for, not only what is accepted.
+/// Sizes in bytes are tried last, because that quirk also changes the request.
 pub(super) async fn least<T>(
     mut call: impl AsyncFnMut(Quirks) -> Result<T, Error>,
 ) -> Result<Tolerated<T>, Error> {
@@ -19,8 +19,8 @@ pub(super) async fn least<T>(
         Ok(value) => return Ok(Tolerated { value, needed: Vec::new() }),
         Err(error) => error,
     };
-    // Quirks help only where an answer came and was not accepted, or where the client would not ask
-    // for a key_ID that this KME has given.
+    // Quirks help only if an answer came and was not accepted, or if the client would not ask for a
+    // key_ID that this KME has given.
     let answered = matches!(
         strict.cause(),
         Error::Malformed { .. }
@@ -45,18 +45,18 @@ pub(super) async fn least<T>(
     Err(strict)
 }
 
-/// All names but that of sizes in bytes.
+/// Returns all names except `size-in-bytes`.
 fn but_bytes() -> Vec<&'static str> {
     let names = Quirks::NAMES.iter().map(|(name, _)| *name);
     names.filter(|name| *name != "size-in-bytes").collect()
 }
 
-/// All that only accept more than the specification allows.
+/// Returns all quirks that only accept more than the specification allows.
 pub(super) fn lenient() -> Quirks {
     sum(&but_bytes())
 }
 
-/// The quirks with the given names.
+/// Returns the quirks with these names.
 fn sum(names: &[&'static str]) -> Quirks {
     let chosen = Quirks::NAMES.iter().filter(|(name, _)| names.contains(name));
     chosen.fold(Quirks::STRICT, |all, (_, quirk)| all | *quirk)

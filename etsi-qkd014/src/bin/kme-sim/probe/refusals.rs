@@ -1,4 +1,4 @@
-//! What a KME has to refuse, asked for without touching a key that exists.
+//! Requests that a KME has to refuse, and that name no existing key.
 
 use serde_json::Value;
 
@@ -7,13 +7,13 @@ use super::report::{Report, Verdict};
 use super::wire::{Raw, Wire};
 use crate::CommandResult;
 
-/// An ID that no KME has given to an SAE or key: it is new.
+/// Returns a new ID, which no KME has given to an SAE or key.
 pub(super) fn nobody() -> String {
     format!("kme-sim-probe-{}", unknown_key_id())
 }
 
 fn unknown_key_id() -> String {
-    // Randomness from std, enough for an ID that must only be new.
+    // Randomness from std suffices for an ID that only has to be new.
     use std::hash::{BuildHasher, Hasher};
     let random = || std::hash::RandomState::new().build_hasher().finish();
     let (a, b) = (random(), random());
@@ -21,7 +21,7 @@ fn unknown_key_id() -> String {
     format!("{:08x}-{:04x}-4{c:03x}-8{d:03x}-{:012x}", a >> 32, a >> 16 & 0xffff, b >> 16)
 }
 
-/// Requests that no KME may serve and that ask for no key that exists.
+/// Sends requests that no KME may serve and that name no existing key.
 pub(super) async fn refusals(
     party: &Party,
     slave: &str,
@@ -55,7 +55,7 @@ pub(super) async fn refusals(
     Ok(())
 }
 
-/// A refusal by a code that the specification names for it.
+/// Checks that a request is refused with a code that the specification names for it.
 pub(super) fn refused(
     report: &mut Report,
     clause: &'static str,
@@ -69,8 +69,8 @@ pub(super) fn refused(
     }
 }
 
-/// A refusal for which the specification names no code: another than the usual ones is worth a note, and no
-/// fault. Serving the request is one.
+/// Checks a refusal for which the specification names no code. An unusual code is noted and no failure; serving the
+/// request is a failure.
 pub(super) fn not_served(
     report: &mut Report,
     clause: &'static str,
@@ -86,7 +86,7 @@ pub(super) fn not_served(
     }
 }
 
-/// The words that the specification gives for a refusal.
+/// Checks that a refusal has the message that the specification gives.
 pub(super) fn message(
     report: &mut Report,
     clause: &'static str,
@@ -103,7 +103,7 @@ pub(super) fn message(
     }
 }
 
-/// Clause 6.5, where the answer is one that has a body.
+/// Checks the error format of clause 6.5, if the answer has a body.
 fn error_format(report: &mut Report, raw: &Result<Raw, String>) {
     let expected = "an error: message, and details of objects or none";
     let body = match raw {

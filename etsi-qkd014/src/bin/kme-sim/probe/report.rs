@@ -1,16 +1,16 @@
-//! What the probe found, as a table.
+//! The results of the probe as a table.
 
 use std::fmt;
 
-/// What came of one check.
+/// The result of one check.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Verdict {
     Pass,
     Fail,
-    /// Against the specification, and a client with these quirks works all the same.
+    /// The answer is against the specification, but a client with these quirks works.
     Tolerated(Vec<&'static str>),
     Skipped(String),
-    /// Nothing that the specification asks for, or leaves no doubt about.
+    /// The specification does not require it, or is not clear about it.
     Note,
 }
 
@@ -33,7 +33,7 @@ struct Row {
     verdict: Verdict,
 }
 
-/// The table, in the order of the checks.
+/// The rows of the table, in the order of the checks.
 #[derive(Default)]
 pub(super) struct Report {
     rows: Vec<Row>,
@@ -66,7 +66,7 @@ impl Report {
         self.row(clause, expected, "-", Verdict::Skipped(why.to_owned()));
     }
 
-    /// Whether nothing failed and nothing had to be tolerated.
+    /// Returns whether no check failed and none needed a quirk.
     pub(super) fn passed(&self) -> bool {
         let bad = |row: &Row| matches!(row.verdict, Verdict::Fail | Verdict::Tolerated(_));
         !self.rows.iter().any(bad)
@@ -103,7 +103,7 @@ impl fmt::Display for Report {
     }
 }
 
-/// A KME's words for a terminal: nothing that steers it, and not without end.
+/// Escapes and truncates a KME's text, so that it is safe for a terminal.
 fn shown(text: &str) -> String {
     const MOST: usize = 100;
     let shaped = |c: char| matches!(c, '"' | '\'' | '\\') || c.escape_debug().len() == 1;

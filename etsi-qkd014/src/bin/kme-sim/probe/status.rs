@@ -1,4 +1,4 @@
-//! Checks that read: the connection and the status.
+//! Checks that only read: the connection and the status.
 
 use etsi_qkd014::{Error, Status};
 use serde_json::Value;
@@ -21,7 +21,7 @@ const NUMBERS: [&str; 7] = [
     "max_SAE_ID_count",
 ];
 
-/// Whether the KME can be talked to at all; everything else stands on it.
+/// Checks whether the KME can be reached at all. All other checks depend on it.
 pub(super) async fn connection(
     party: &Party,
     slave: &str,
@@ -70,7 +70,7 @@ pub(super) async fn connection(
                 let timed_out = why.contains("timed out");
                 report.check("5.1", expected, why, !timed_out);
             }
-            // Front ends of some KMEs end the handshake and refuse by status.
+            // Front ends of some KMEs complete the handshake and refuse by status code.
             Ok(raw) => {
                 report.check("5.1", expected, raw.summary(), matches!(raw.status, 400 | 401))
             }
@@ -79,7 +79,7 @@ pub(super) async fn connection(
     Ok(true)
 }
 
-/// The status, raw and as the client reads it.
+/// Checks the status, both the raw answer and as the client reads it.
 pub(super) async fn status(
     party: &Party,
     slave: &str,
@@ -108,7 +108,8 @@ pub(super) async fn status(
     Ok(read.ok())
 }
 
-/// What stands in for a failure where the client needs, and has, quirks against it.
+/// Returns the verdict: a failed check is tolerated if the client needs one of the quirks that
+/// help.
 fn judge(passed: bool, helps: &[&'static str], needed: &[&'static str]) -> Verdict {
     let used: Vec<_> = helps.iter().copied().filter(|name| needed.contains(name)).collect();
     match (passed, used.is_empty()) {

@@ -1,4 +1,4 @@
-//! The connection: versions and groups of TLS, and who is let in.
+//! Checks of the connection: versions and groups of TLS, and client certificates.
 
 use std::sync::Arc;
 
@@ -20,13 +20,13 @@ use tokio_rustls::TlsConnector;
 use super::party::Party;
 use crate::{CommandResult, other};
 
-/// With which certificate the probe comes.
+/// The certificate with which the probe connects.
 #[derive(Clone, Copy)]
 pub(super) enum Auth {
-    /// The SAE's.
+    /// The certificate of the SAE.
     Sae,
     None,
-    /// One with the SAE's name that no CA of the KME's has signed.
+    /// A certificate with the SAE's name that no CA of the KME has signed.
     Stranger,
 }
 
@@ -87,7 +87,7 @@ fn private_key(bytes: &[u8]) -> CommandResult<PrivateKeyDer<'static>> {
     } else {
         PrivateKeyDer::try_from(bytes).ok().map(|key| key.clone_key())
     };
-    // The parser's reason is not passed on: it has seen the key.
+    // The parser's reason is not passed on, because the parser has seen the key.
     read.ok_or_else(|| other("the SAE's key cannot be read"))
 }
 
@@ -105,8 +105,8 @@ fn stranger(sae: &str) -> CommandResult<(CertificateDer<'static>, PrivateKeyDer<
     Ok((certificate, PrivateKeyDer::Pkcs8(key.serialize_der().into())))
 }
 
-/// webpki's checks. The name may be another where the KME is known by its ID alone; the client
-/// that the probe calls first has checked that ID.
+/// webpki's checks. The host name may differ if the KME is identified by its ID alone; the client
+/// that the probe calls first has checked the ID.
 #[derive(Debug)]
 struct Verifier {
     webpki: Arc<WebPkiServerVerifier>,
@@ -131,7 +131,7 @@ impl ServerCertVerifier for Verifier {
             now,
         );
         match verified {
-            // webpki looks at the name after everything else.
+            // webpki checks the name after everything else.
             Err(InvalidCertificate(
                 CertificateError::NotValidForName | CertificateError::NotValidForNameContext { .. },
             )) if self.any_name => Ok(ServerCertVerified::assertion()),
@@ -162,7 +162,7 @@ impl ServerCertVerifier for Verifier {
     }
 }
 
-/// A handshake; the group that it agreed on.
+/// Makes a handshake, and returns its key exchange group.
 pub(super) async fn handshake(party: &Party, config: ClientConfig) -> CommandResult<String> {
     let url = Url::parse(&party.url).map_err(other)?;
     let host = url.host_str().ok_or_else(|| other("the URL has no host"))?;
@@ -185,7 +185,7 @@ async fn tcp(url: &Url) -> std::io::Result<TcpStream> {
     TcpStream::connect((host, url.port_or_known_default().unwrap_or(443))).await
 }
 
-/// Offers TLS 1.1 and nothing newer; whether it was refused, and what came.
+/// Offers only TLS 1.1. Returns whether that was refused, and a description of the answer.
 pub(super) async fn old_version(party: &Party) -> CommandResult<(bool, &'static str)> {
     let url = Url::parse(&party.url).map_err(other)?;
     let exchange = async {
@@ -204,7 +204,7 @@ pub(super) async fn old_version(party: &Party) -> CommandResult<(bool, &'static 
     })
 }
 
-/// A ClientHello as RFC 4346, 7.4.1.2 has it, with suites that servers of its time knew.
+/// Returns a ClientHello of RFC 4346, 7.4.1.2, with suites that servers of that time supported.
 fn client_hello_of_tls_1_1() -> Vec<u8> {
     const VERSION: [u8; 2] = [3, 2];
     const SUITES: [[u8; 2]; 6] =
@@ -212,7 +212,7 @@ fn client_hello_of_tls_1_1() -> Vec<u8> {
     // supported_groups: secp256r1 and secp384r1; ec_point_formats: uncompressed (RFC 8422).
     const EXTENSIONS: [u8; 16] = [0, 10, 0, 6, 0, 4, 0, 23, 0, 24, 0, 11, 0, 2, 1, 0];
     let mut body = VERSION.to_vec();
-    // Its randomness protects nothing: the handshake goes no further.
+    // The random bytes protect nothing, because the handshake goes no further.
     body.extend_from_slice(&[0x5a; 32]);
     body.push(0);
     body.extend_from_slice(&[0, SUITES.len() as u8 * 2]);

@@ -1,4 +1,4 @@
-//! Requests as they stand, and answers as they come.
+//! Raw requests and answers.
 
 use reqwest::{Method, Url};
 use rustls::ClientConfig;
@@ -8,7 +8,7 @@ use zeroize::Zeroizing;
 use super::party::Party;
 use crate::{CommandResult, other};
 
-/// Largest answer that is read.
+/// Largest answer that is read, in bytes.
 const MAX_BODY: usize = 1 << 20;
 
 pub(super) struct Wire {
@@ -20,7 +20,7 @@ pub(super) struct Raw {
     pub(super) status: u16,
     pub(super) version: String,
     pub(super) media: Option<String>,
-    /// May hold keys that were not asked for, hence zeroized.
+    /// May contain keys that were not requested, so it is zeroized.
     pub(super) body: Zeroizing<Vec<u8>>,
 }
 
@@ -29,12 +29,12 @@ impl Raw {
         serde_json::from_slice(&self.body).ok()
     }
 
-    /// The `message` of an error (clause 6.5).
+    /// Returns the `message` of an error (clause 6.5).
     pub(super) fn message(&self) -> Option<String> {
         Some(self.json()?.get("message")?.as_str()?.to_owned())
     }
 
-    /// The status with the message of an error, for the table.
+    /// Returns the status with the message of an error, for the table.
     pub(super) fn summary(&self) -> String {
         match self.message().filter(|_| self.status != 200) {
             Some(message) => format!("{} {message:?}", self.status),
@@ -53,7 +53,7 @@ impl Wire {
             .redirect(reqwest::redirect::Policy::none())
             .retry(reqwest::retry::never())
             .timeout(party.timeout)
-            // Each request on a connection of its own: one fault spoils one check.
+            // Each request uses its own connection, so that a fault affects only one check.
             .pool_max_idle_per_host(0)
             .build()
             .map_err(other)?;
@@ -88,7 +88,7 @@ impl Wire {
     }
 }
 
-/// The reason below the libraries' own.
+/// Returns the innermost reason, below the texts of the libraries.
 fn innermost(error: &reqwest::Error) -> String {
     let mut error: &dyn std::error::Error = error;
     while let Some(source) = error.source() {
