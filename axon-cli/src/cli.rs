@@ -1,4 +1,4 @@
-//! The command line: what can be typed, and what `--help` says.
+//! The arguments of the command line, and the texts of `--help`.
 
 use std::path::PathBuf;
 
@@ -453,7 +453,8 @@ mod tests {
         assert!(accepted >= 20, "{accepted} commands");
     }
 
-    /// The terminal's width decides where a line ends: a break in the text would be one more.
+    /// Checks that help texts contain no line break of their own, because the terminal's width decides where a line
+    /// ends.
     fn assert_unbroken(command: &clap::Command) {
         let text = command.get_after_help().map(ToString::to_string).unwrap_or_default();
         let is_prose = |line: &str| !line.is_empty() && !line.starts_with(' ');

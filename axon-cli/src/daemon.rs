@@ -1,4 +1,4 @@
-//! `axon daemon`: the daemon in the foreground, or as a session of this tool starts it.
+//! `axon daemon`: runs the daemon in the foreground, or as a session of this tool starts it.
 
 use std::{io::Read, process::ExitCode, thread};
 
@@ -21,10 +21,10 @@ pub(crate) fn run(args: &cli::Daemon) -> Result<ExitCode, CliError> {
     Ok(axon_daemon::main(start))
 }
 
-/// Ends this process as SIGTERM would, when standard input ends.
+/// Ends this process as SIGTERM does when standard input ends.
 fn end_with_stdin() {
     let mut ignored = [0; 64];
     while std::io::stdin().read(&mut ignored).is_ok_and(|count| count > 0) {}
-    // To itself: that cannot fail while there is somebody to see it fail.
+    // A signal to this process itself does not fail.
     let _ = kill_process(getpid(), Signal::TERM);
 }

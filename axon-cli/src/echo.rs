@@ -1,4 +1,4 @@
-//! `axon echo`: a line for each message of a topic.
+//! `axon echo`: prints a line for each message of a topic.
 
 use std::{
     collections::HashMap,
@@ -17,13 +17,13 @@ use serde_json::json;
 
 use crate::{cli, failure::CliError, interrupt, logging, say::say, session, text};
 
-/// Bytes of the payload that a line shows.
+/// The number of payload bytes that a line shows.
 const HEAD: usize = 16;
 
-/// Messages that may wait when the subscription asks for no profile.
+/// The depth of the subscription if no profile is given.
 const DEPTH: u32 = 1_000;
 
-/// Time in which a topic that is there shows up in the graph.
+/// The time in which an existing topic appears in the graph.
 const GRAPH_DELAY: Duration = Duration::from_secs(1);
 
 /// Runs `axon echo`.
@@ -48,14 +48,14 @@ pub(crate) fn run(args: &cli::Echo) -> Result<(), CliError> {
     outcome
 }
 
-/// Counts what was not printed: messages missing among those that came (lost, or passed over since more came than
-/// may wait), and those for which standard output has no room.
+/// Counts the messages that were not printed. Some are missing among the received ones: they were lost, or dropped
+/// because more came than the depth allows. Others were received, but standard output had no room for them.
 #[derive(Default)]
 struct Numbers {
-    /// The last number of each publisher.
+    /// The last sequence number of each publisher.
     last: HashMap<Gid, u64>,
     missing: u64,
-    /// Those that came and could not be printed.
+    /// Messages that were received and could not be printed.
     unprinted: u64,
 }
 
@@ -64,14 +64,14 @@ impl Numbers {
         let last = self.last.entry(info.publisher).or_insert(info.sequence);
         let missing = info.sequence.saturating_sub(last.saturating_add(1));
         *last = info.sequence.max(*last);
-        // A publisher may say any number: so many it cannot have published.
+        // A publisher may send any number. It cannot have published as many messages as a larger gap means.
         if missing < 1 << 32 {
             self.missing += missing;
         }
     }
 }
 
-/// Prints messages until there were as many as asked for, nobody reads them, or a signal comes.
+/// Prints messages until the requested number has been printed, standard output is closed, or a signal comes.
 fn print(
     args: &cli::Echo,
     session: &Session,
@@ -98,7 +98,7 @@ fn print(
             let line = if args.json { as_json(&info, &payload) } else { as_text(&info, &payload) };
             match writeln!(out, "{line}").and_then(|()| out.flush()) {
                 Ok(()) => {}
-                // The reader of the pipe has seen enough.
+                // The reader of the pipe closed it, so it wants no more lines.
                 Err(error) if error.kind() == io::ErrorKind::BrokenPipe => return Ok(()),
                 Err(error) => {
                     numbers.unprinted += 1;
@@ -111,7 +111,7 @@ fn print(
     Ok(())
 }
 
-/// The type of the topic's first endpoint, as soon as there is one.
+/// Returns the type of the topic's first endpoint. Waits until there is one.
 fn find_type(session: &Session, topic: &str) -> String {
     let mut found = None;
     let mut look = |graph: &GraphView| {
@@ -129,7 +129,7 @@ fn find_type(session: &Session, topic: &str) -> String {
     found.unwrap_or_default()
 }
 
-/// What the topic's publishers offer: RELIABLE where all of them do.
+/// Returns the QoS to request: RELIABLE unless a publisher of the topic offers BEST_EFFORT.
 fn qos_of(session: &Session, topic: &str) -> Qos {
     let graph = session.graph();
     let best_effort = graph.endpoints.values().map(|entry| &entry.endpoint).any(|endpoint| {

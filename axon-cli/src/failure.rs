@@ -1,4 +1,4 @@
-//! How a command fails, and the exit status that says so.
+//! The failures of commands, and the exit status of each.
 
 use std::{fmt::Display, process::ExitCode};
 
@@ -6,25 +6,26 @@ use axon_transport::config::ConfigError;
 
 use crate::say::say;
 
-/// Why a command ends without having done its work.
+/// The reason why a command did not complete its work.
 #[derive(Debug)]
 pub(crate) enum CliError {
-    /// A setting is unknown, obsolete or half-given: status 2, and this one line names it.
+    /// A setting is unknown, obsolete or incomplete. The exit status is 2, and this one line names
+    /// the setting.
     Setting(String),
-    /// Anything else: status 1.
+    /// Any other failure. The exit status is 1.
     Failed(String),
 }
 
 impl CliError {
-    /// A failure that is not a setting's.
+    /// Returns a failure that does not concern a setting.
     pub(crate) fn failed(reason: impl Display) -> Self {
         Self::Failed(reason.to_string())
     }
 
-    /// Says why on standard error; the exit status.
+    /// Writes the reason to standard error, and returns the exit status.
     pub(crate) fn report(&self) -> ExitCode {
         match self {
-            // One line, whatever the setting held.
+            // Escaping keeps this one line, whatever the setting contains.
             Self::Setting(line) => {
                 say(format_args!("axon: {}", crate::text::printable(line)));
                 ExitCode::from(2)

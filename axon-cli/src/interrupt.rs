@@ -1,4 +1,4 @@
-//! SIGINT, SIGTERM and SIGHUP as a condition at which a session waits, so that a command can say how it was
+//! Makes SIGINT, SIGTERM and SIGHUP a condition that a session waits for, so that a command can report its results
 //! before it ends.
 
 use std::{io, process, thread};
@@ -9,7 +9,7 @@ use tokio::{
     signal::unix::{SignalKind, signal},
 };
 
-/// Whether whoever started this process had it outlive its terminal, as `nohup` does.
+/// Returns whether this process was started to outlive its terminal, as `nohup` does.
 fn ignores_hangup() -> bool {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
@@ -18,10 +18,10 @@ fn ignores_hangup() -> bool {
     mask.is_some_and(|mask| mask & 1 == 1)
 }
 
-/// A condition that is triggered by the first signal. The second ends the process.
+/// Returns a condition that the first signal triggers. The second signal ends the process.
 ///
 /// # Errors
-/// When the system does not let signals be followed.
+/// The system does not let this process handle signals.
 pub(crate) fn of(session: &Session) -> io::Result<GuardCondition> {
     let guard = session.create_guard_condition();
     let condition = guard.clone();
@@ -43,7 +43,7 @@ pub(crate) fn of(session: &Session) -> io::Result<GuardCondition> {
         };
         signal();
         guard.trigger();
-        // The command may hang in a write that nobody reads.
+        // The command may be blocked in a write to a pipe that nobody reads.
         signal();
         process::exit(130);
     })?;

@@ -1,4 +1,4 @@
-//! Where log lines go: standard error, filtered by `AXON_LOG`.
+//! Sends log lines to standard error, filtered by `AXON_LOG`.
 
 use axon_daemon::log;
 use axon_transport::config::Config;
@@ -6,20 +6,20 @@ use tracing_subscriber::EnvFilter;
 
 use crate::failure::CliError;
 
-/// Reads the configuration and sets logging up as it says.
+/// Reads the configuration and sets up logging accordingly.
 ///
 /// # Errors
-/// A setting that is unknown, obsolete or half-given.
+/// A setting is unknown, obsolete or incomplete.
 pub(crate) fn configure() -> Result<Config, CliError> {
     let config = check()?;
     log::start(&config);
     Ok(config)
 }
 
-/// Reads the configuration, the log filter included, and sets nothing up.
+/// Reads the configuration and the log filter, and sets up nothing.
 ///
 /// # Errors
-/// As for [`configure`].
+/// The same as for [`configure`].
 pub(crate) fn check() -> Result<Config, CliError> {
     let config = Config::from_env()?;
     EnvFilter::try_new(&config.log).map_err(|error| {

@@ -1,8 +1,8 @@
-//! The tool `axon`.
+//! The command-line tool `axon`.
 
-// But for the memory that `bench` shares between two processes by itself.
+// Only the memory that `bench` shares between two processes is an exception.
 #![deny(unsafe_code)]
-// `say` writes there, and does not panic where that fails.
+// `say` writes to standard error instead, and does not panic if the write fails.
 #![warn(clippy::print_stderr)]
 
 mod acl;
@@ -31,7 +31,7 @@ use clap::Parser;
 
 use crate::cli::{Bench, Cli, Command};
 
-/// Erases in `axon daemon` alone.
+/// Erases freed memory in `axon daemon` only.
 #[global_allocator]
 static HEAP: ErasingHeap = ErasingHeap;
 

@@ -1,4 +1,4 @@
-//! `axon play`: a recorded log, published as it was recorded.
+//! `axon play`: publishes a recorded log with its recorded timing.
 
 use std::{
     io::IsTerminal,
@@ -21,17 +21,17 @@ use crate::{
     session, text,
 };
 
-/// Messages read ahead of their time.
+/// The number of messages that are read ahead of their time.
 const READ_AHEAD: usize = 64;
-/// The end of a replay waits so long while other hosts acknowledge nothing.
+/// The longest wait at the end of a replay while other hosts acknowledge nothing.
 const UNACKNOWLEDGED: Duration = Duration::from_secs(15);
-/// The status counts losses of links once a second. After this time it has those of the replay.
+/// The status counts losses of links once a second. After this time it includes those of the replay.
 const STATUS_INTERVAL: Duration = Duration::from_millis(1_200);
-/// Between two looks at what is not acknowledged.
+/// The time between two checks for messages that are not acknowledged.
 const CHECK_INTERVAL: Duration = Duration::from_millis(10);
 
 impl Profile {
-    /// The policies of the profile.
+    /// Returns the QoS policies of the profile.
     pub(crate) fn qos(self) -> Qos {
         match self {
             Self::KeepAll => Qos::keep_all(),
@@ -41,16 +41,16 @@ impl Profile {
     }
 }
 
-/// How far a replay is.
+/// The progress of a replay.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Sent {
-    /// Messages published.
+    /// The number of messages published.
     pub(crate) messages: u64,
-    /// Their bytes.
+    /// The number of their bytes.
     pub(crate) bytes: u64,
-    /// How often a full reader made the publisher wait.
+    /// How often the publisher waited for a full reader.
     pub(crate) waits: u64,
-    /// Messages that were published while their topic had fewer subscriptions than were waited for.
+    /// Messages that were published while their topic had fewer subscriptions than `--wait` requires.
     pub(crate) missed: u64,
 }
 
@@ -131,16 +131,16 @@ pub(crate) fn run(args: &cli::Play) -> Result<(), CliError> {
     unheard(outcome.left, outcome.given_up, missed)
 }
 
-/// What became of the messages of a replay.
+/// The state of a replay's messages at its end.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 struct Outcome {
-    /// Messages that their RELIABLE and KEEP_ALL subscriptions have.
+    /// Messages that their RELIABLE and KEEP_ALL subscriptions have received.
     acknowledged: u64,
     /// Messages of topics with such subscriptions that are not acknowledged.
     left: u64,
     /// Messages of such topics that will never be acknowledged.
     given_up: u64,
-    /// Messages of other topics that are not acknowledged, or never will be.
+    /// Messages of other topics that are not acknowledged or will never be.
     unpromised: u64,
 }
 
@@ -166,14 +166,14 @@ impl Outcome {
     }
 }
 
-/// Samples of the replay's topics that this host's daemon dropped on their way, as its status says.
+/// Samples of the replay's topics that this host's daemon dropped, as its status reports.
 struct Dropped {
     daemon: String,
     samples: u64,
 }
 
 impl Dropped {
-    /// `None`: the status cannot be had.
+    /// Reads the count from the status. Returns `None` if there is no status.
     fn of(session: &Session, topics: &[&str]) -> Option<Self> {
         let status: Status = serde_json::from_str(&session.status_json().ok()?).ok()?;
         let own = status.topics.iter().filter(|topic| topics.contains(&topic.topic.as_str()));
@@ -181,13 +181,13 @@ impl Dropped {
         Some(Self { daemon: status.daemon, samples })
     }
 
-    /// How many more `now` has. `None`: it is of another daemon.
+    /// Returns how many samples were dropped between `self` and `now`. Returns `None` if `now` is of another daemon.
     fn since(&self, now: &Self) -> Option<u64> {
         (self.daemon == now.daemon).then(|| now.samples.saturating_sub(self.samples))
     }
 }
 
-/// What is said of subscriptions that were not promised everything.
+/// Returns the message about subscriptions that were not promised everything.
 fn unpromised(others: &str, outcome: &Outcome, dropped: Option<u64>) -> String {
     let mut text = others.to_owned();
     if let Some(dropped) = dropped.filter(|dropped| *dropped > 0) {
@@ -201,7 +201,7 @@ fn unpromised(others: &str, outcome: &Outcome, dropped: Option<u64>) -> String {
     text
 }
 
-/// Waits until other hosts have acknowledged what was published, for as long as that gets on.
+/// Waits until other hosts have acknowledged everything. Gives up after `patience` without a new acknowledgement.
 fn wait_acknowledged(publishers: &[Publisher], patience: Duration) {
     let left = || publishers.iter().map(Publisher::unacknowledged).sum::<u64>();
     let (mut least, mut since) = (left(), Instant::now());
@@ -214,7 +214,7 @@ fn wait_acknowledged(publishers: &[Publisher], patience: Duration) {
     }
 }
 
-/// Why a replay is not known to have reached each subscription that was promised everything, if so.
+/// Returns an error if the replay may not have reached each subscription that was promised everything.
 fn unheard(left: u64, given_up: u64, missed: u64) -> Result<(), CliError> {
     let mut why = Vec::new();
     if left > 0 {
@@ -239,7 +239,7 @@ fn unheard(left: u64, given_up: u64, missed: u64) -> Result<(), CliError> {
     Err(CliError::failed(format_args!("{why}. `axon status` on both hosts shows links and losses")))
 }
 
-/// A publisher for each topic of the log.
+/// Creates a publisher for each topic of the log.
 pub(crate) fn publishers(
     session: &Session,
     survey: &Survey,
@@ -252,7 +252,7 @@ pub(crate) fn publishers(
     survey.topics.iter().map(publisher).collect()
 }
 
-/// Waits until every publisher has `count` readers; the index of one that has not in time.
+/// Waits until every publisher has `count` readers. Returns the index of a publisher that did not have them in time.
 pub(crate) fn wait_matched(
     publishers: &[Publisher],
     count: usize,
@@ -264,10 +264,9 @@ pub(crate) fn wait_matched(
     })
 }
 
-/// Publishes the log at `rate` times its pace, in the order of the file: a message that was
-/// recorded before the one in front of it goes at once. Messages of topics with fewer subscriptions than
-/// `readers` are counted, and `served` counts those for which a subscription was promised everything. `progress` says
-/// whether to go on.
+/// Publishes the log at `rate` times its pace, in the order of the file. A message that was recorded before its
+/// predecessor is published at once. The result counts messages of topics with fewer subscriptions than `readers`.
+/// `served` counts messages for which a subscription was promised everything. `progress` returns whether to continue.
 pub(crate) fn replay(
     survey: &Survey,
     session: &Session,
@@ -282,7 +281,8 @@ pub(crate) fn replay(
         let message = message.map_err(CliError::failed)?;
         let pace = *pace.get_or_insert_with(|| Pace::new(message.time, rate));
         thread::sleep(pace.until(message.time, Instant::now()));
-        // Before: a subscription that got the last message may leave with it.
+        // The subscriptions are read before the message is published, because a subscription may end as soon as it has
+        // the last message.
         let matched = publishers[message.topic].matched();
         let there = matched.len();
         served.look(session, message.topic, matched);
@@ -310,7 +310,7 @@ pub(crate) fn replay(
     Ok(sent)
 }
 
-/// Reads and decompresses on a thread of its own, so that neither disturbs the pace.
+/// Reads and decompresses in another thread, so that neither delays publication.
 fn read_ahead(
     survey: &Survey,
 ) -> Result<impl Iterator<Item = Result<Message, LogError>> + use<>, CliError> {
@@ -326,7 +326,7 @@ fn read_ahead(
     Ok(receiver.into_iter())
 }
 
-/// Maps recorded time to time now.
+/// Maps recorded time to current time.
 #[derive(Clone, Copy, Debug)]
 struct Pace {
     start: Instant,
@@ -339,13 +339,13 @@ impl Pace {
         Self { start: Instant::now(), first, rate }
     }
 
-    /// How long to wait at `now` for a message recorded at `time`.
+    /// Returns how long to wait at `now` for a message recorded at `time`.
     fn until(&self, time: u64, now: Instant) -> Duration {
         if self.rate == 0.0 {
             return Duration::ZERO;
         }
         let recorded = Duration::from_nanos(time.saturating_sub(self.first));
-        // A time that no clock reaches (a rate next to zero) is waited for a day at a time.
+        // A time beyond the range of the clock (a rate near zero) is waited for one day at a time.
         let due = Duration::try_from_secs_f64(recorded.as_secs_f64() / self.rate)
             .unwrap_or(Duration::MAX);
         due.saturating_sub(now.duration_since(self.start)).min(Duration::from_secs(86_400))

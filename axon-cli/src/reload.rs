@@ -1,4 +1,4 @@
-//! `axon reload`: the daemon reads its settings again.
+//! `axon reload`: makes the daemon read its settings again.
 
 use std::{io::Write as _, process::ExitCode};
 
@@ -9,7 +9,7 @@ use crate::{failure::CliError, session::failure, text::printable};
 /// Runs `axon reload`.
 ///
 /// # Errors
-/// There is no daemon, or its settings are wrong.
+/// No daemon runs, or its settings are wrong.
 pub(crate) fn run() -> Result<ExitCode, CliError> {
     let report = axon_transport::daemon_reload_at(&DaemonLocation::from_env()?).map_err(failure)?;
     if let Some(error) = &report.error {
@@ -27,7 +27,8 @@ pub(crate) fn run() -> Result<ExitCode, CliError> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// What went wrong, and what the daemon took all the same.
+/// Returns the text for a failed reload: the error, and the settings that the daemon changed
+/// nevertheless.
 fn refused(error: &str, changed: &[String]) -> String {
     match changed {
         [] => format!("nothing was changed: {error}"),

@@ -1,13 +1,13 @@
-//! Lines for people on standard error.
+//! Writes lines for users to standard error.
 
 use std::{fmt::Display, io::Write as _};
 
 use crate::text::printable;
 
-/// Writes a line, or several, to standard error. They may quote a peer or a file: what could steer a
-/// terminal is escaped.
+/// Writes one or several lines to standard error. They may quote a peer or a file, so characters that could control a
+/// terminal are escaped.
 ///
-/// A standard error that is closed or full loses the line and ends nothing: `eprintln!` would panic.
+/// If standard error is closed or full, the line is lost and the process continues; `eprintln!` would panic.
 pub(crate) fn say(line: impl Display) {
     let text = line.to_string();
     let lines: Vec<String> = text.split('\n').map(printable).collect();

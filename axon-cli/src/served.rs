@@ -1,4 +1,4 @@
-//! The subscriptions that a replay served, by what it may say of them.
+//! Records the subscriptions that a replay served, and what was promised to each.
 
 use std::collections::HashMap;
 
@@ -11,14 +11,14 @@ use axon_transport::{
 
 use crate::text;
 
-/// What a publisher promises a subscription.
+/// The delivery guarantee of a publisher to a subscription.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Promise {
     /// Every message: both are RELIABLE and KEEP_ALL.
     Everything,
-    /// The newest messages, as many as the depth says: the subscription is RELIABLE, and one of both is KEEP_LAST.
+    /// The newest messages, up to the depth: both are RELIABLE, and one of them is KEEP_LAST.
     Newest,
-    /// Nothing: the subscription, or the publisher, is BEST_EFFORT.
+    /// Nothing: the subscription or the publisher is BEST_EFFORT.
     Nothing,
 }
 
@@ -39,7 +39,7 @@ impl Promise {
 #[derive(Debug, Default)]
 struct Matched {
     gids: Vec<Gid>,
-    /// Whether the graph has shown all of them.
+    /// Whether the graph has shown all of these subscriptions.
     is_known: bool,
     keeps_all: bool,
     /// Messages for which a subscription was promised everything.
@@ -55,13 +55,14 @@ pub(crate) struct Served {
 }
 
 impl Served {
-    /// Nobody, by so many publishers with the QoS `offered`.
+    /// Returns a record without subscriptions, for this number of publishers with the QoS `offered`.
     pub(crate) fn new(offered: Qos, publishers: usize) -> Self {
         let matched = std::iter::repeat_with(Matched::default).take(publishers).collect();
         Self { offered, matched, promises: HashMap::new() }
     }
 
-    /// A message of this publisher goes to these subscriptions. [`count`](Self::count) counts it once it is published.
+    /// Records that the next message of this publisher goes to these subscriptions. [`count`](Self::count) counts the
+    /// message after it is published.
     pub(crate) fn look(&mut self, session: &Session, publisher: usize, gids: Vec<Gid>) {
         let before = &self.matched[publisher];
         if before.is_known && before.gids == gids {
@@ -84,18 +85,18 @@ impl Served {
         matched.gids = gids;
     }
 
-    /// The message that was looked at is published.
+    /// Counts the message for which `look` was called, once it is published.
     pub(crate) fn count(&mut self, publisher: usize) {
         let matched = &mut self.matched[publisher];
         matched.kept += u64::from(matched.keeps_all);
     }
 
-    /// Messages of this publisher for which a subscription was promised everything.
+    /// Returns the number of this publisher's messages for which a subscription was promised everything.
     pub(crate) fn kept(&self, publisher: usize) -> u64 {
         self.matched[publisher].kept
     }
 
-    /// What is to be said of the subscriptions that were not promised everything, if there were any.
+    /// Describes the subscriptions that were not promised everything. Returns `None` if there were none.
     pub(crate) fn others(&self) -> Option<String> {
         let count = |promise| self.promises.values().filter(|of| **of == promise).count() as u64;
         let (newest, nothing) = (count(Promise::Newest), count(Promise::Nothing));

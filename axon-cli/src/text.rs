@@ -1,19 +1,19 @@
-//! Text for people: tables, times, sizes, the head of a payload.
+//! Formats text for users: tables, times, sizes, and the beginning of payloads.
 
 use std::fmt::Write as _;
 
 use axon_transport::internal::text::{escaped, is_plain};
 
-/// A table of text: a header, rows, columns as wide as their widest cell.
+/// A text table with a header and rows. Each column is as wide as its widest cell.
 pub(crate) struct TextTable {
     header: Vec<&'static str>,
-    /// Whether a column is set to the right, as numbers are.
+    /// Whether each column is aligned to the right, as numbers are.
     right: Vec<bool>,
     rows: Vec<Vec<String>>,
 }
 
 impl TextTable {
-    /// An empty table; a header that starts with `>` sets its column to the right.
+    /// Creates an empty table. A header that starts with `>` aligns its column to the right.
     pub(crate) fn new(header: &[&'static str]) -> Self {
         Self {
             header: header.iter().map(|h| h.trim_start_matches('>')).collect(),
@@ -22,17 +22,18 @@ impl TextTable {
         }
     }
 
-    /// Adds a row. Cells may come from a peer: what could steer a terminal is escaped.
+    /// Adds a row. Cells may come from a peer, so characters that could control a terminal are
+    /// escaped.
     pub(crate) fn row(&mut self, cells: impl IntoIterator<Item = String>) {
         self.rows.push(cells.into_iter().map(|cell| printable(&cell)).collect());
     }
 
-    /// Whether there are no rows.
+    /// Returns whether there are no rows.
     pub(crate) fn is_empty(&self) -> bool {
         self.rows.is_empty()
     }
 
-    /// The lines of the table, each ended by a newline and indented by `indent` spaces.
+    /// Returns the lines of the table. Each is indented by `indent` spaces and ends with a newline.
     pub(crate) fn render(&self, indent: usize) -> String {
         let header: Vec<String> = self.header.iter().map(|h| (*h).to_owned()).collect();
         let width = |column: usize| {
@@ -60,12 +61,13 @@ impl TextTable {
     }
 }
 
-/// `text` with every character escaped that could steer a terminal.
+/// Returns `text` with all characters escaped that could control a terminal.
 pub(crate) fn printable(text: &str) -> String {
     escaped(text)
 }
 
-/// A JSON text in which every character that could steer a terminal is escaped; it means the same.
+/// Returns a JSON text in which all characters are escaped that could control a terminal. Its
+/// meaning does not change.
 pub(crate) fn printable_json(json: &str) -> String {
     json.chars().fold(String::with_capacity(json.len()), |mut out, c| {
         if c == '\n' || is_plain(c) {
@@ -79,7 +81,7 @@ pub(crate) fn printable_json(json: &str) -> String {
     })
 }
 
-/// A whole number with its digits in groups of three.
+/// Formats an integer with its digits in groups of three.
 pub(crate) fn grouped(number: u64) -> String {
     let digits = number.to_string();
     let mut out = String::with_capacity(digits.len() + digits.len() / 3);
@@ -92,12 +94,12 @@ pub(crate) fn grouped(number: u64) -> String {
     out
 }
 
-/// A duration in the unit that suits it, three digits.
+/// Formats a duration in a suitable unit with three digits.
 pub(crate) fn duration(nanoseconds: u64) -> String {
     scaled(nanoseconds, &[(1_000_000_000, "s"), (1_000_000, "ms"), (1_000, "us"), (1, "ns")])
 }
 
-/// A number of bytes in the unit that suits it, three digits.
+/// Formats a number of bytes in a suitable unit with three digits.
 pub(crate) fn bytes(count: u64) -> String {
     scaled(count, &[(1_000_000_000, "GB"), (1_000_000, "MB"), (1_000, "kB"), (1, "B")])
 }
@@ -115,7 +117,7 @@ fn scaled(value: u64, units: &[(u64, &str)]) -> String {
     format!("{scaled:.decimals$} {name}")
 }
 
-/// An instant, given in nanoseconds since the Unix epoch, as RFC 3339 in UTC with microseconds.
+/// Formats a time, given in nanoseconds since the Unix epoch, as RFC 3339 in UTC with microseconds.
 pub(crate) fn instant(nanoseconds: i64) -> String {
     let seconds = nanoseconds.div_euclid(1_000_000_000);
     let micros = nanoseconds.rem_euclid(1_000_000_000) / 1_000;
@@ -125,10 +127,10 @@ pub(crate) fn instant(nanoseconds: i64) -> String {
     format!("{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}.{micros:06}Z")
 }
 
-/// The Gregorian date that lies `days` after 1970-01-01.
+/// Returns the Gregorian date that is `days` after 1970-01-01.
 ///
-/// Counts in years that begin in March, so that the leap day ends a year and the months' lengths
-/// follow one linear rule.
+/// The calculation uses years that begin in March, so that the leap day ends a year and the lengths
+/// of months follow one linear rule.
 fn date(days: i64) -> (i64, i64, i64) {
     const FROM_0000_03_01_TO_1970: i64 = 719_468;
     const DAYS_IN_400_YEARS: i64 = 146_097;
@@ -145,7 +147,7 @@ fn date(days: i64) -> (i64, i64, i64) {
     (year, month, day)
 }
 
-/// The first bytes of a payload in hexadecimal.
+/// Formats the first bytes of a payload in hexadecimal.
 pub(crate) fn hex(payload: &[u8], at_most: usize) -> String {
     let mut out = String::new();
     for (i, byte) in payload.iter().take(at_most).enumerate() {
@@ -155,7 +157,7 @@ pub(crate) fn hex(payload: &[u8], at_most: usize) -> String {
     out
 }
 
-/// The first bytes of a payload as ASCII, a dot for everything else.
+/// Formats the first bytes of a payload as ASCII, with a dot for each other byte.
 pub(crate) fn ascii(payload: &[u8], at_most: usize) -> String {
     let visible = |b: &u8| if (0x20..0x7f).contains(b) { char::from(*b) } else { '.' };
     payload.iter().take(at_most).map(visible).collect()

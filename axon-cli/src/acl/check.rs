@@ -1,4 +1,4 @@
-//! `axon acl check`: whether a peer may do something, and which rule decides.
+//! `axon acl check`: reports whether a peer may do something, and which rule decides.
 
 use std::{io::Write as _, process::ExitCode};
 
@@ -17,7 +17,7 @@ use crate::{
     text::{TextTable, printable},
 };
 
-/// Uses that a peer is asked about at a time.
+/// The number of uses in one question to a peer.
 const USES_PER_QUESTION: usize = 32;
 
 /// Runs `axon acl check`.
@@ -33,7 +33,8 @@ pub(super) fn run(args: &cli::Check) -> Result<ExitCode, CliError> {
     let mut table = TextTable::new(&["it would", "here", "there"]);
     let mut allowed = true;
     let uses = args.what.uses();
-    // What this host does there is the other end of what the peer does here.
+    // On the peer's side this host is the other end: it subscribes where the peer publishes, and serves where the peer
+    // calls.
     let ends: Vec<_> = uses.iter().map(|(verb, name)| (other_end(*verb), name.clone())).collect();
     let there = match &status {
         Some(status) => there(status, peer, &ends),
@@ -68,13 +69,14 @@ pub(super) fn run(args: &cli::Check) -> Result<ExitCode, CliError> {
     Ok(if allowed { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
-/// The status of the daemon, where one runs.
+/// Returns the status of the daemon, or `None` if none runs.
 fn status() -> Option<Status> {
     let place = DaemonLocation::from_env().ok()?;
     serde_json::from_str(&axon_transport::daemon_status_at(&place).ok()?).ok()
 }
 
-/// The daemon may have been started with other settings than this process, or before the file was changed.
+/// Warns if the rules of the daemon may differ from `rules`. The daemon may have been started with other settings than
+/// this process, or before the file was changed.
 fn warn_of_other_rules(status: &Status, rules: &AccessRules) {
     if status.withheld {
         return say(format_args!(
@@ -99,8 +101,8 @@ fn warn_of_other_rules(status: &Status, rules: &AccessRules) {
     }
 }
 
-/// What the peer's rules say of each of these uses by this host. A peer may have more than one link: what one of them denies
-/// is denied.
+/// Returns, for each use by this host, the decision of the peer's rules. A peer may have more than one link. A use that
+/// one of them denies is denied.
 fn there(status: &Status, peer: Principal<'_>, uses: &[(Verb, String)]) -> Vec<String> {
     let links: Vec<_> = status.links.iter().filter(|link| is_of(link, peer)).collect();
     let answers: Vec<_> = links.iter().filter_map(|link| ask(link, uses)).collect();
@@ -115,7 +117,8 @@ fn there(status: &Status, peer: Principal<'_>, uses: &[(Verb, String)]) -> Vec<S
     all.collect()
 }
 
-/// The decisions of the peer of one link, if it answers: a daemon of an earlier version does not.
+/// Returns the decisions of the peer of one link. Returns `None` if the peer does not answer: a daemon of an earlier
+/// version does not know the question.
 fn ask(link: &LinkStatus, uses: &[(Verb, String)]) -> Option<Vec<PeerDecision>> {
     let place = DaemonLocation::from_env().ok()?;
     let mut decisions = Vec::new();
@@ -142,7 +145,7 @@ fn ask(link: &LinkStatus, uses: &[(Verb, String)]) -> Option<Vec<PeerDecision>> 
     Some(decisions)
 }
 
-/// What the peer has said by itself: it names what it denies to endpoints that there are.
+/// Returns what the peer's reports say about a use. A peer reports what it denies to the endpoints that exist.
 fn heard(status: &Status, links: &[&LinkStatus], verb: Verb, name: &str) -> String {
     if links.is_empty() {
         return "not linked".to_owned();
@@ -154,7 +157,7 @@ fn heard(status: &Status, links: &[&LinkStatus], verb: Verb, name: &str) -> Stri
     if links.iter().any(|link| link.more_denied > 0) {
         return "not known: more is denied than status lists".to_owned();
     }
-    // The peer speaks of endpoints that there are.
+    // The peer reports only about endpoints that exist.
     let ours = status.topics.iter().filter(|topic| topic.topic == name).any(|topic| match verb {
         Verb::Publish => topic.publishers > 0,
         Verb::Subscribe => topic.subscriptions > 0,
@@ -168,7 +171,7 @@ fn heard(status: &Status, links: &[&LinkStatus], verb: Verb, name: &str) -> Stri
     text.to_owned()
 }
 
-/// Whether a link is of this peer, as rules name it. What a host calls itself proves nothing.
+/// Returns whether a link belongs to this peer, as rules name it. The name that a host gives itself proves nothing.
 fn is_of(link: &LinkStatus, peer: Principal<'_>) -> bool {
     match (Principal::parse(&link.party), peer) {
         (Ok(Principal::Name(of)), Principal::Certificate(name)) => of.eq_ignore_ascii_case(name),
@@ -186,7 +189,7 @@ mod tests {
 
     use super::*;
 
-    /// A link of this party, whose host calls itself something else.
+    /// Returns a link of this party, whose host gives itself another name.
     fn link(party: &str) -> LinkStatus {
         let mut link = LinkStatus::default();
         (link.host, link.party) = ("localhost".into(), party.into());

@@ -1,4 +1,4 @@
-//! What can be typed after `axon acl`.
+//! The arguments of `axon acl`.
 
 use std::{path::PathBuf, time::Duration};
 
@@ -40,7 +40,7 @@ pub(crate) enum Acl {
     Learn(Learn),
 }
 
-/// What clap makes of the group is one line that is wider than a page.
+/// The usage that clap derives from the group is one line that is wider than a terminal.
 const CHECK_USAGE: &str =
     "axon acl check --peer <PEER> --publish|--subscribe|--serve|--call|--act|--see <NAME> [FILE]";
 
@@ -94,7 +94,7 @@ pub(crate) struct What {
 }
 
 impl What {
-    /// Each verb and name that has to be allowed.
+    /// Returns each verb and name that must be allowed.
     pub(super) fn uses(&self) -> Vec<(Verb, String)> {
         let one = |verb, name: &Option<String>| name.clone().map(|name| (verb, name));
         let simple = [
@@ -189,7 +189,7 @@ pub(crate) struct Learn {
     pub(crate) see: bool,
 }
 
-/// A time with a unit.
+/// Parses a time with a unit.
 fn duration(text: &str) -> Result<Duration, String> {
     let unit = text.find(|c: char| !c.is_ascii_digit() && c != '.').unwrap_or(text.len());
     let (number, unit) = text.split_at(unit);

@@ -1,4 +1,4 @@
-//! `axon acl`: who may do what, by the access rules of this host.
+//! `axon acl`: shows, tests and writes the access rules of this host.
 
 mod check;
 pub(crate) mod cli;
@@ -28,7 +28,7 @@ pub(crate) fn run(args: &Acl) -> Result<ExitCode, CliError> {
     }
 }
 
-/// The party that a name stands for: with certificates upper and lower case are the same.
+/// Returns the party that a name stands for. With certificates, upper and lower case are the same.
 fn party(name: &str) -> Result<Principal<'_>, &'static str> {
     let with_certificates = Config::from_env().is_ok_and(
         |config| matches!(config.security, Security::Classic(c) if c.auth == ClassicAuth::Ca),
@@ -39,7 +39,7 @@ fn party(name: &str) -> Result<Principal<'_>, &'static str> {
     })
 }
 
-/// The rules of a file, or those that a daemon with these settings has.
+/// Returns the rules of a file, or without a file those that a daemon with these settings has.
 fn rules(file: Option<&Path>) -> Result<AccessRules, CliError> {
     let Some(path) = file else { return Ok(logging::check()?.with_rules_of_host()?.access) };
     let shown = path.display();

@@ -1,4 +1,4 @@
-//! `axon acl test`: the rules of a file beside the expectations in it.
+//! `axon acl test`: compares the rules of a file with the expectations in it.
 
 use std::{io::Write as _, process::ExitCode};
 

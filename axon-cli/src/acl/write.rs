@@ -1,4 +1,5 @@
-//! Rules as text: names escaped, and the parts of actions and parameters in one line each.
+//! Writes rules as text. Names are escaped. The parts of an action, and the services of parameters and of a lifecycle
+//! node, become one line.
 
 use std::{collections::BTreeSet, fmt::Write as _};
 
@@ -13,7 +14,7 @@ use axon_transport::{
 /// Patterns of names, sorted.
 pub(super) type Names = BTreeSet<String>;
 
-/// What one `[[allow]]` or `[[deny]]` says.
+/// The contents of one `[[allow]]` or `[[deny]]`.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(super) struct Uses {
     pub(super) publish: Names,
@@ -31,7 +32,7 @@ impl Uses {
         *self == Self::default()
     }
 
-    /// Writes an action whose parts are all there as one name.
+    /// Replaces all parts of an action by the action's name.
     pub(super) fn collapse_actions(&mut self) {
         for action in complete(&self.call, &ACTION_SERVICES) {
             if has_all(&self.subscribe, &action, &ACTION_TOPICS) {
@@ -49,8 +50,8 @@ impl Uses {
         }
     }
 
-    /// Writes a node whose parameter services are all called as one name. `parameters` means the topic of changes as
-    /// well.
+    /// Replaces the parameter services of a node by the node's name, where all are called and the topic of parameter
+    /// changes is subscribed to. `parameters` also allows that topic.
     pub(super) fn collapse_parameters(&mut self) {
         let all = |name: &String| name == "/**" || name == "**" || name == PARAMETER_EVENTS;
         if !self.subscribe.iter().any(all) {
@@ -63,7 +64,8 @@ impl Uses {
         }
     }
 
-    /// Writes a lifecycle node whose services are all called, and whose topic is subscribed to, as one name.
+    /// Replaces the services and the topic of a lifecycle node by the node's name, where all services are called and
+    /// the topic is subscribed to.
     pub(super) fn collapse_lifecycle(&mut self) {
         for node in complete(&self.call, &LIFECYCLE_SERVICES) {
             if has_all(&self.subscribe, &node, &[LIFECYCLE_TOPIC]) {
@@ -74,7 +76,7 @@ impl Uses {
         }
     }
 
-    /// The rule as TOML. `header` is `allow` or `deny`.
+    /// Returns the rule as TOML. `header` is `allow` or `deny`.
     pub(super) fn toml(&self, header: &str, peer: &str) -> String {
         let mut text = format!("[[{header}]]\npeer = {}\n", quoted(peer));
         for (key, names) in [
@@ -98,7 +100,7 @@ impl Uses {
     }
 }
 
-/// The names that `parts[0]` follows in `names`, where all other parts are there, too.
+/// Returns the names that `names` holds with each of `parts` appended.
 fn complete(names: &Names, parts: &[&str]) -> Vec<String> {
     let bases = names.iter().filter_map(|name| name.strip_suffix(parts[0])?.strip_suffix('/'));
     let whole = bases.filter(|base| TopicPattern::new(base).is_ok() && has_all(names, base, parts));
@@ -115,7 +117,7 @@ fn remove_all(names: &mut Names, base: &str, parts: &[&str]) {
     }
 }
 
-/// A string of TOML. What is not a plain character of ASCII is escaped.
+/// Returns a TOML string. All characters except printable ASCII are escaped.
 pub(super) fn quoted(text: &str) -> String {
     let mut out = String::from("\"");
     for c in text.chars() {
@@ -129,10 +131,10 @@ pub(super) fn quoted(text: &str) -> String {
     out
 }
 
-/// Whether the text can be used as a file of rules.
+/// Parses the text as a file of rules.
 ///
 /// # Errors
-/// Why it cannot.
+/// The text is not a valid file of rules; the error says why.
 pub(super) fn verify(text: &str) -> Result<AccessRules, String> {
     AccessRules::parse(text, "the rules to write").map_err(|error| error.to_string())
 }

@@ -1,21 +1,21 @@
-//! What AXON may take at most, as ratios to the raw limit in the same run.
+//! The most that AXON may take, as ratios to the raw limit in the same run.
 
 use crate::bench::harness::{Load, Motion, Wake};
 
-/// Bytes that a descriptor holds.
+/// The most bytes that a descriptor holds.
 const INLINE: usize = 88;
-/// From here on a copy is judged by its bytes alone.
+/// The smallest message for which the bytes alone decide the cost of a copy.
 const BYTES_ALONE: usize = 16 << 10;
 
-/// A publish to sixteen reader processes, wake-ups aside, by one to a single one.
+/// The most that a publish to sixteen reader processes may take, divided by a publish to one. Wake-ups do not count.
 pub(super) const SIXTEEN_READERS: f64 = 1.3;
 
-/// Of the messages a second of bare quinn, at least.
+/// The smallest rate of messages, divided by that of bare quinn.
 pub(super) const OF_QUINN: f64 = 0.85;
-/// The processor time of a message, by that of bare quinn.
+/// The most processor time of a message, divided by that of bare quinn.
 pub(super) const CPU_BY_QUINN: f64 = 1.25;
 
-/// How many times the latency of the raw limit is allowed.
+/// Returns the largest permitted ratio of the latency to the raw limit's. Returns `None` for a load without a budget.
 pub(super) fn latency(load: &Load) -> Option<f64> {
     match (load.wake, load.motion) {
         (Wake::Poll, Motion::Copy) if load.size <= INLINE => Some(1.3),
@@ -27,17 +27,17 @@ pub(super) fn latency(load: &Load) -> Option<f64> {
     }
 }
 
-/// A ratio as it is written, in thousandths.
+/// Rounds a ratio to thousandths, as reports show it.
 pub(super) fn rounded(ratio: f64) -> f64 {
     (ratio * 1e3).round() / 1e3
 }
 
-/// Whether a ratio is within a budget, as far as its digits say: 1.05 that is written is within 1.05.
+/// Returns whether a ratio is within a budget after both are rounded. A ratio that is shown as 1.05 is within 1.05.
 pub(super) fn is_met(ratio: f64, budget: f64) -> bool {
     rounded(ratio) <= rounded(budget)
 }
 
-/// The word for a ratio beside its budget.
+/// Returns the text that reports show beside a budget.
 pub(super) fn verdict(ratio: f64, budget: f64) -> &'static str {
     if is_met(ratio, budget) { "met" } else { "not met" }
 }
@@ -64,7 +64,7 @@ mod tests {
         assert_eq!(latency(&paced), Some(1.1));
         assert_eq!(of(64, Wake::Event, Motion::Copy), None);
         assert_eq!((verdict(1.3, 1.3), verdict(1.31, 1.3)), ("met", "not met"));
-        // What is written as 1.050 is within 1.05, and 1.051 is not.
+        // A ratio that is shown as 1.050 is within 1.05. A ratio that is shown as 1.051 is not.
         assert!(is_met(1.0504, 1.05) && !is_met(1.0506, 1.05));
         assert!(is_met(0.85, 0.8496) && !is_met(0.85, 0.8494));
     }

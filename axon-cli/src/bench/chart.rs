@@ -1,4 +1,4 @@
-//! The results as charts.
+//! Draws the results as charts.
 
 use super::{
     Compared, KINDS, Results, STREAMS,
@@ -7,7 +7,7 @@ use super::{
 };
 use crate::text;
 
-/// All of them on one page.
+/// Returns all charts on one page.
 pub(super) fn svg(results: &Results) -> String {
     let mut charts = Vec::new();
     for (wake, motion) in KINDS {
@@ -41,7 +41,8 @@ pub(super) fn svg(results: &Results) -> String {
             .map(|cost| (cost.readers as f64, of(cost).all().p50()))
             .collect(),
     };
-    // The smallest and the largest: as many lines as there are colours.
+    // The chart shows the smallest and the largest size, because it has as many colours as these
+    // two need.
     let ends = sizes.first().into_iter().chain(sizes.last());
     charts.push(Chart {
         title: "A publish, by processes that sleep and read it".to_owned(),

@@ -1,5 +1,5 @@
-//! `axon bench`: what AXON costs beside what the machine gives without it, and its sessions beside its
-//! own shared memory.
+//! `axon bench`: compares AXON's shared memory with the machine's raw limits, and AXON's sessions with its own shared
+//! memory.
 
 mod budgets;
 mod chart;
@@ -25,7 +25,7 @@ use self::{
 };
 use crate::{cli, failure::CliError};
 
-/// Sizes of a quick run: inline, copied, in place.
+/// The sizes of a quick run. Messages of these sizes are inline, copied, and in place.
 const QUICK_SIZES: [usize; 3] = [8, 4 << 10, 64 << 10];
 
 /// The kinds of latency that are measured, in the order of the tables.
@@ -40,27 +40,28 @@ const KINDS: [(Wake, Motion); 6] = [
 /// The kinds of streams.
 const STREAMS: [Motion; 3] = [Motion::Copy, Motion::Fill, Motion::Touch];
 
-/// Sizes of messages that have a pace, and of those that many processes read, unless others are asked for.
+/// The default sizes of messages that have a pace. `READ_SIZES` are the default sizes of messages that many processes
+/// read.
 const FEW_SIZES: [usize; 2] = [64, 64 << 10];
 const READ_SIZES: [usize; 4] = [64, 4 << 10, 64 << 10, 1 << 20];
-/// From message to message: 100 Hz and 1 kHz.
+/// The times from message to message: 100 Hz and 1 kHz.
 const PACES: [Duration; 2] = [Duration::from_millis(10), Duration::from_millis(1)];
 
-/// The raw limits first: of each load one, and of those that have a pace two.
+/// The media. The raw limits come first. Each load has one raw limit, and a load with a pace has two.
 const MEDIA: [&dyn Medium; 4] =
     [&Raw(Sleeps::Epoll), &Raw(Sleeps::SpinEpoll), &Raw(Sleeps::Futex), &Axon];
 
 const ANSWERING: &str = "bench-answer";
 const READING: &str = "bench-read";
 
-/// A load, and what the raw limit and AXON made of it.
+/// The times of the raw limit and of AXON under one load.
 struct Compared {
     load: Load,
     raw: Rounds,
     axon: Rounds,
 }
 
-/// A load with a pace, and what two raw limits and AXON made of it.
+/// The times of two raw limits and of AXON under a load with a pace.
 struct Paced {
     load: Load,
     epoll: Rounds,
@@ -68,12 +69,12 @@ struct Paced {
     axon: Rounds,
 }
 
-/// All that was measured.
+/// All measurements.
 struct Results {
     run: Run,
-    /// By kind, then by size.
+    /// Sorted by kind, then by size.
     latency: Vec<Compared>,
-    /// By pace, then by size.
+    /// Sorted by pace, then by size.
     paced: Vec<Paced>,
     streams: Vec<Compared>,
     publish: Vec<Cost>,
@@ -99,12 +100,12 @@ pub(crate) fn shm(args: &cli::BenchShm) -> Result<(), CliError> {
     Ok(())
 }
 
-/// Is the process that answers one that measures.
+/// Runs as the process that answers one that measures.
 pub(crate) fn answer() -> Result<(), CliError> {
     harness::serve(&MEDIA).map_err(CliError::failed)
 }
 
-/// Is one of the readers that a publish is measured with.
+/// Runs as one of the reader processes of a publish measurement.
 pub(crate) fn read() -> Result<(), CliError> {
     readers::attend().map_err(CliError::failed)
 }

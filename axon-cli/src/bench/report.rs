@@ -1,4 +1,4 @@
-//! The results as text, and as JSON.
+//! Formats the results as text and as JSON.
 
 use std::fmt::Write as _;
 
@@ -11,7 +11,7 @@ use super::{
 };
 use crate::text::{self, TextTable};
 
-/// How figures are taken from rounds; in every output.
+/// Explains in every output how figures are obtained from rounds.
 const REPORTED: &str = "Raw and AXON take turns. Times are one way (half a round trip): p50 of the \
                         round in which it was least, p99 and p99.9 of all rounds together. Ratios: \
                         of those p50, and the median of the rounds' ratios. A budget is judged by \
@@ -189,7 +189,8 @@ fn publish_table<'a>(costs: impl Iterator<Item = &'a Cost>) -> String {
     table.render(0)
 }
 
-/// What may be said of the most readers by one, wake-ups aside.
+/// Returns the budget for the ratio of the most readers to one reader. It does not apply where the
+/// publisher wakes the readers.
 fn budget_of(cost: &Cost) -> Option<f64> {
     let judged = cost.until == Until::Told && cost.readers == READERS[READERS.len() - 1];
     judged.then_some(budgets::SIXTEEN_READERS)

@@ -1,4 +1,4 @@
-//! What every benchmark says of a run: of which machine it is, and how its figures were taken.
+//! Describes the run in every report: the machine, and how the figures were obtained.
 
 use serde_json::{Value, json};
 
@@ -17,7 +17,7 @@ impl Run {
         Ok(Self { machine: Machine::look()?, effort, quick })
     }
 
-    /// What stands above the tables. `reported` says how figures are taken.
+    /// Returns the text above the tables. `reported` explains how figures are obtained.
     pub(super) fn heading(&self, reported: &str) -> String {
         let mut out = format!("{}\n{reported}\n", self.machine.line());
         if self.quick {
@@ -26,7 +26,7 @@ impl Run {
         out
     }
 
-    /// The results of `axon bench NAME` as JSON: the same, and `figures`.
+    /// Returns the results of `axon bench NAME` as JSON: the description of the run, and `figures`.
     pub(super) fn document<const N: usize>(
         &self,
         name: &str,

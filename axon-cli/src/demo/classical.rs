@@ -1,5 +1,5 @@
-//! A client that is right in all but its key exchange: plain quinn and stock rustls, offering
-//! classical groups alone.
+//! A client that is correct except for its key exchange: plain quinn and stock rustls, which offer
+//! only classical groups.
 
 use std::{net::SocketAddr, sync::Arc, time::Duration};
 
@@ -26,27 +26,27 @@ use rustls::{
 pub(crate) const CLASSICAL: [&dyn SupportedKxGroup; 3] =
     [kx_group::X25519, kx_group::SECP256R1, kx_group::SECP384R1];
 
-/// Time that the peer has to answer.
+/// The time in which the peer has to answer.
 const ANSWER: Duration = Duration::from_secs(5);
 
-/// What came of the attempt.
+/// The result of the attempt.
 #[derive(Debug)]
 pub(crate) enum ClassicalAttempt {
     /// The handshake completed.
     Connected,
     /// The peer ended the handshake.
     Refused {
-        /// With this TLS alert, if with one.
+        /// The TLS alert, if the peer sent one.
         alert: Option<u8>,
-        /// In these words.
+        /// The peer's reason.
         reason: String,
     },
 }
 
-/// Connects from the address of `from` to an AXON daemon in classic, offering `groups`.
+/// Connects from the address `from` to an AXON daemon in classic, and offers `groups`.
 ///
 /// # Errors
-/// When nothing answers or the client cannot be made: then nothing was refused.
+/// Nothing answers, or the client cannot be created. In these cases nothing was refused.
 pub(crate) async fn connect(
     groups: &[&'static dyn SupportedKxGroup],
     from: SocketAddr,
@@ -75,7 +75,8 @@ pub(crate) async fn connect(
     }
 }
 
-/// TLS 1.3 with every cipher of rustls, a raw public key on both sides and no SNI, as AXON has it.
+/// Returns a TLS 1.3 configuration with every cipher of rustls. It has a raw public key on both
+/// sides and no SNI, as AXON has.
 fn client(groups: &[&'static dyn SupportedKxGroup]) -> Result<rustls::ClientConfig, Error> {
     let provider = CryptoProvider { kx_groups: groups.to_vec(), ..default_provider() };
     let key = rcgen::KeyPair::generate().map_err(|e| Error::General(e.to_string()))?;
@@ -94,7 +95,7 @@ fn client(groups: &[&'static dyn SupportedKxGroup]) -> Result<rustls::ClientConf
     Ok(config)
 }
 
-/// Takes any raw public key whose signature is right, as AXON does without trust material.
+/// Accepts any raw public key whose signature is valid, as AXON does without trust material.
 #[derive(Debug)]
 struct AnyRawKey;
 

@@ -1,9 +1,10 @@
-//! Files that say which SAE a host is, in the form that `kme-sim init` prints: a line a variable,
-//! `export NAME='VALUE'`, as a shell reads it. A shell's expansions are not done.
+//! Reads files that tell which SAE a host is, in the form that `kme-sim init` prints: one line for
+//! each variable, `export NAME='VALUE'`, with a shell's quoting. A shell's expansions are not
+//! performed.
 
 use std::path::Path;
 
-/// The variables that may stand in the file.
+/// The variables that the file may set.
 const KNOWN: [&str; 9] = [
     "AXON_KME_URL",
     "AXON_KME_CA",
@@ -16,14 +17,14 @@ const KNOWN: [&str; 9] = [
     "AXON_SAE_KEY",
 ];
 
-/// Those that must.
+/// The variables that the file must set.
 const REQUIRED: [&str; 5] =
     ["AXON_KME_URL", "AXON_KME_CA", "AXON_SAE_ID", "AXON_SAE_CERT", "AXON_SAE_KEY"];
 
 /// The length of the largest file that is read.
 const MAX: u64 = 64 << 10;
 
-/// Reads a file; the reason, with its path and line, where it cannot be used.
+/// Reads a file. An error names the path, and the line if a line is wrong.
 pub(crate) fn read(path: &Path) -> Result<Vec<(String, String)>, String> {
     let failed = |why: String| format!("{}: {why}", path.display());
     let length = std::fs::metadata(path).map_err(|e| failed(e.to_string()))?.len();
@@ -63,7 +64,7 @@ fn parse(text: &str) -> Result<Vec<(String, String)>, String> {
     }
 }
 
-/// A value without its quotes; `None` where a shell would read it as something else.
+/// Returns a value without its quotes. Returns `None` if a shell would read the value differently.
 fn unquoted(value: &str) -> Option<String> {
     if let Some(inner) = value.strip_prefix('\'') {
         let inner = inner.strip_suffix('\'')?.replace("'\\''", "\0");

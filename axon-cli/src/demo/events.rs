@@ -1,4 +1,5 @@
-//! What the demo's players and subscribers say on standard output: one JSON object a line.
+//! Events that the demo's players and subscribers write to standard output, one JSON object on each
+//! line.
 
 use std::io::{self, Write};
 
@@ -6,35 +7,36 @@ use serde::{Deserialize, Serialize};
 
 use super::tally::RunTally;
 
-/// One line.
+/// One event, which is one line.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
 pub(crate) enum Event {
-    /// A subscriber's subscriptions exist; a player's publishers have the readers they wait for.
+    /// A subscriber's subscriptions exist, or a player's publishers have the readers that they wait
+    /// for.
     Ready,
-    /// So many messages were published, or received.
+    /// This number of messages was published or received.
     Progress {
-        /// Count from the start.
+        /// The number since the start.
         messages: u64,
     },
     /// A player has published the whole log.
     Sent {
-        /// Messages published.
+        /// The number of messages published.
         messages: u64,
-        /// How often a full reader made it wait.
+        /// How often the player waited for a full reader.
         waits: u64,
     },
-    /// A subscriber is done.
+    /// A subscriber has finished.
     Outcome(RunTally),
-    /// It cannot go on.
+    /// The process cannot continue.
     Failed {
-        /// Why.
+        /// The reason.
         reason: String,
     },
 }
 
 impl Event {
-    /// Writes the line to standard output at once.
+    /// Writes the event to standard output and flushes it.
     pub(crate) fn say(&self) -> io::Result<()> {
         let mut line = serde_json::to_vec(self)?;
         line.push(b'\n');

@@ -1,5 +1,5 @@
-//! The demo's hosts: a daemon each, with a runtime directory, an address and an identity of its
-//! own, as processes of this same binary.
+//! The demo's hosts. Each has a daemon, a runtime directory, an address and an identity of its own.
+//! Its processes run this same binary.
 
 use std::{
     ffi::OsString,
@@ -13,36 +13,36 @@ use tokio::{process::Command, time::Instant};
 
 use super::{DemoError, mode::Mode, process::Process};
 
-/// Time that a daemon has to be up.
+/// The time in which a daemon has to start.
 const START: Duration = Duration::from_secs(20);
 
-/// Domains that ROS 2 users hardly use; which one, the process id says, so that two demos at the
-/// same time do not meet.
+/// Returns a domain that ROS 2 users rarely use. It depends on the process id, so that two demos at
+/// the same time do not connect.
 pub(crate) fn domain() -> u32 {
     181 + std::process::id() % 52
 }
 
-/// What a host is started with.
+/// The properties with which a host is started.
 #[derive(Clone, Debug)]
 pub(crate) struct HostSpec {
-    /// Its name in messages, such as `host A`.
+    /// The name in messages, such as `host A`.
     pub(crate) name: &'static str,
-    /// File name stem of what it keeps.
+    /// The stem of the names of the host's files.
     pub(crate) stem: &'static str,
-    /// Its loopback address.
+    /// The loopback address.
     pub(crate) address: &'static str,
-    /// The other host's.
+    /// The loopback address of the other host.
     pub(crate) peer: &'static str,
     /// The security mode.
     pub(crate) mode: Mode,
-    /// `AXON_KME_*` and `AXON_SAE_*`, in qkd.
+    /// The variables `AXON_KME_*` and `AXON_SAE_*`, in qkd.
     pub(crate) identity: Vec<(String, String)>,
-    /// SAE IDs that it takes as peers, `;`-separated, in qkd.
+    /// The SAE IDs that the host accepts as peers, separated by `;`, in qkd.
     pub(crate) peers: String,
 }
 
 impl HostSpec {
-    /// The host's settings.
+    /// Returns the host's settings.
     pub(crate) fn settings(&self, runtime_dir: &Path) -> Vec<(String, OsString)> {
         let mut settings: Vec<(String, OsString)> = vec![
             ("AXON_RUNTIME_DIR".into(), runtime_dir.into()),
@@ -70,7 +70,7 @@ pub(crate) struct Host {
 }
 
 impl Host {
-    /// Starts the host's daemon; `dir` holds what it keeps, `logs` what it says.
+    /// Starts the host's daemon. `dir` holds its files, and `logs` holds its log.
     pub(crate) async fn start(spec: &HostSpec, dir: &Path, logs: &Path) -> Result<Self, DemoError> {
         let runtime_dir = dir.join(format!("{}-{}", spec.mode.stem(), spec.stem));
         private_dir(&runtime_dir)
@@ -85,7 +85,7 @@ impl Host {
         Ok(host)
     }
 
-    /// A command of this binary under the host's settings.
+    /// Returns a command that runs this binary with the host's settings.
     pub(crate) fn command(&self) -> Result<Command, DemoError> {
         axon(&self.settings)
     }
@@ -97,7 +97,7 @@ impl Host {
         Process::start(&format!("the {role} on {}", self.name), command, &self.log)
     }
 
-    /// What the host's daemon says of itself.
+    /// Returns the status of the host's daemon.
     pub(crate) async fn status(&self) -> Result<Value, DemoError> {
         let failed = |reason| DemoError::Status { host: self.name, reason };
         let mut command = self.command()?;
@@ -109,7 +109,7 @@ impl Host {
         serde_json::from_slice(&output.stdout).map_err(|e| failed(e.to_string()))
     }
 
-    /// Ends the host.
+    /// Stops the host.
     pub(crate) async fn stop(self) {
         self.daemon.stop().await;
     }
@@ -127,7 +127,8 @@ impl Host {
     }
 }
 
-/// This binary under `settings`, and under no other setting of AXON or ROS but `AXON_LOG`.
+/// Returns a command that runs this binary with `settings`. Of the other variables of AXON and ROS
+/// it inherits only `AXON_LOG`.
 pub(crate) fn axon(settings: &[(String, OsString)]) -> Result<Command, DemoError> {
     let binary = std::env::current_exe()
         .map_err(|source| DemoError::Start { name: "axon".to_owned(), source })?;

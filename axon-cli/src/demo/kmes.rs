@@ -1,5 +1,5 @@
-//! The demo's two KMEs: the simulator in this process, mutual TLS under a CA of its own, or KMEs
-//! that run elsewhere.
+//! The demo's two KMEs. They are simulators in this process, with mutual TLS under their own CA, or
+//! KMEs that run elsewhere.
 
 use std::{
     ops::Sub,
@@ -11,40 +11,40 @@ use serde::Serialize;
 
 use super::{DemoError, env_file};
 
-/// The party that asks a KME for keys.
+/// The party that requests keys from a KME.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Role {
     /// Host A.
     A,
     /// Host B.
     B,
-    /// The wrong peers. Host B takes this SAE as a peer, so that they are refused for the one thing
-    /// that is wrong with them and not for their name.
+    /// The wrong peers. Host B accepts this SAE as a peer, so that each wrong peer is refused for
+    /// its one defect and not for its name.
     Visitor,
 }
 
 const SAES: [&str; 3] = ["sae-a", "sae-b", "sae-visitor"];
 const KMES: [&str; 2] = ["kme-a", "kme-b"];
 
-/// Two KMEs that share keys as a QKD link lets them.
+/// Two KMEs that share keys, as the KMEs of a QKD link do.
 pub(crate) enum Kmes {
-    /// In this process.
+    /// KMEs in this process.
     Simulated {
         /// The KMEs.
         network: Box<sim::Network>,
-        /// Where their certificates are.
+        /// The directory of their certificates.
         dir: PathBuf,
     },
-    /// Elsewhere: the variables of host A and of host B.
+    /// KMEs that run elsewhere, given by the variables of host A and of host B.
     External([Vec<(String, String)>; 2]),
 }
 
-/// Keys that the KMEs handed out.
+/// The numbers of keys that the KMEs delivered.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub(crate) struct KeysHandedOut {
-    /// To the SAE that asked first (enc_keys).
+    /// Keys delivered to the SAE that asked first (enc_keys).
     pub(crate) to_masters: u64,
-    /// To its peer, by key_ID (dec_keys).
+    /// Keys delivered to its peer, by key_ID (dec_keys).
     pub(crate) to_slaves: u64,
 }
 
@@ -60,7 +60,7 @@ impl Sub for KeysHandedOut {
 }
 
 impl Kmes {
-    /// Starts both; `dir` takes certificates and keys.
+    /// Starts both KMEs. `dir` holds their certificates and keys.
     pub(crate) async fn start(dir: &Path) -> Result<Self, DemoError> {
         let failed = |error: sim::Error| DemoError::Kme(error.to_string());
         let [a, b, visitor] = SAES;
@@ -75,7 +75,7 @@ impl Kmes {
         Ok(Self::Simulated { network: Box::new(network), dir: dir.to_owned() })
     }
 
-    /// Takes KMEs that run elsewhere, as the files of host A and of host B say.
+    /// Uses KMEs that run elsewhere, as the files of host A and of host B describe.
     pub(crate) fn external(host_a: &Path, host_b: &Path) -> Result<Self, DemoError> {
         let read = |path| env_file::read(path).map_err(DemoError::KmeEnv);
         let kmes = Self::External([read(host_a)?, read(host_b)?]);
@@ -86,8 +86,8 @@ impl Kmes {
         Ok(kmes)
     }
 
-    /// The ID of an SAE. KMEs elsewhere are asked for two only: the wrong peers come under the name
-    /// of host A, when host A has ended.
+    /// Returns the ID of an SAE. External KMEs know only two SAEs. The wrong peers then use the
+    /// name of host A after host A has ended.
     pub(crate) fn sae(&self, role: Role) -> &str {
         match self {
             Self::Simulated { .. } => SAES[role as usize],
@@ -98,7 +98,7 @@ impl Kmes {
         }
     }
 
-    /// What a host is told of its KME.
+    /// Returns the variables that tell a host its KME and its identity.
     pub(crate) fn identity(&self, role: Role) -> Vec<(String, String)> {
         match self {
             Self::Simulated { network, dir } => {
@@ -109,7 +109,7 @@ impl Kmes {
         }
     }
 
-    /// The SAEs that host B takes as peers.
+    /// Returns the SAEs that host B accepts as peers.
     pub(crate) fn peers_of_b(&self) -> String {
         match self {
             Self::Simulated { .. } => [self.sae(Role::A), self.sae(Role::Visitor)].join(";"),
@@ -117,12 +117,12 @@ impl Kmes {
         }
     }
 
-    /// Whether the wrong peers have an SAE to themselves.
+    /// Returns whether the wrong peers have their own SAE.
     pub(crate) fn has_visitor(&self) -> bool {
         matches!(self, Self::Simulated { .. })
     }
 
-    /// Keys handed out since the start, where the KMEs tell.
+    /// Returns the number of keys delivered since the start. External KMEs do not report it.
     pub(crate) fn handed_out(&self) -> Option<KeysHandedOut> {
         let Self::Simulated { network, .. } = self else { return None };
         let counters = network.kmes().iter().map(sim::Kme::counters);

@@ -1,5 +1,5 @@
-//! `axon demo`: two hosts on one machine, every route between them, and the peers that must not
-//! get in.
+//! `axon demo`: replays a log between two hosts on one machine over every route, and attempts
+//! connections that must be refused.
 
 mod classical;
 mod env_file;
@@ -42,12 +42,12 @@ use crate::{
 
 pub(crate) use self::{player::run as run_player, subscriber::run as run_subscriber};
 
-/// The log that is replayed when none is given, so that the binary alone suffices.
+/// The log that is replayed by default. It is part of the binary, so that the demo needs no file.
 const RECORDED: &[u8] = include_bytes!("../../data/mit-csail.mcap");
 const RECORDED_NAME: &str = "mit-csail.mcap";
 
-/// Why the demo cannot go on. A lost message or a wrong peer let in is no such error: the report
-/// says it.
+/// An error that ends the demo. A lost message, or a wrong peer that is let in, is not such an
+/// error; the report states it.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum DemoError {
     #[error("cannot make the demo's directory: {0}")]
@@ -72,7 +72,7 @@ pub(crate) enum DemoError {
     Interrupted,
 }
 
-/// Runs the demo. The exit status is 0 only when all was as it must be.
+/// Runs the demo. The exit status is 0 only if every result is as required.
 pub(crate) fn run(args: &cli::Demo) -> Result<ExitCode, CliError> {
     logging::check()?;
     let runtime = tokio::runtime::Builder::new_multi_thread()
@@ -135,7 +135,7 @@ async fn show(args: &cli::Demo) -> Result<Report, DemoError> {
         routes.push(outcomes.remote);
         progress.step(mode.route(), "wrong peers");
         let Pair { a, b } = pair;
-        // Under the name of host A nobody else can come while it runs.
+        // No other peer can use the name of host A while host A runs.
         let host_a = if kmes.has_visitor() {
             Some(a)
         } else {
@@ -200,7 +200,7 @@ fn unpack(dir: &Path) -> Result<PathBuf, DemoError> {
     Ok(file)
 }
 
-/// Resolves when the demo is told to stop.
+/// Returns when a signal tells the demo to stop.
 async fn interrupted() -> DemoError {
     let follow = |kind| signal(kind).map_err(DemoError::Signals);
     let signals = (

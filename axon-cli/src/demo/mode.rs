@@ -1,23 +1,23 @@
-//! The security modes that the demo shows, and that are measured.
+//! The security modes that the demo shows and that benchmarks measure.
 
 use clap::ValueEnum;
 
-/// A way to establish keys between two hosts.
+/// A method of establishing keys between two hosts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Mode {
     /// X25519MLKEM768.
     Classic,
     /// A KME key for each QUIC session.
     Session,
-    /// That, and a KME key for every ten messages.
+    /// A KME key for each QUIC session, and a KME key for every ten messages.
     Messages10,
 }
 
 impl Mode {
-    /// All, in the order of the demo.
+    /// All modes, in the order of the demo.
     pub(crate) const ALL: [Self; 3] = [Self::Classic, Self::Session, Self::Messages10];
 
-    /// The name of the route between hosts.
+    /// Returns the name of the route between hosts.
     pub(crate) fn route(self) -> &'static str {
         match self {
             Self::Classic => "QUIC classic",
@@ -26,7 +26,7 @@ impl Mode {
         }
     }
 
-    /// For file names.
+    /// Returns the text that file names contain.
     pub(crate) fn stem(self) -> &'static str {
         match self {
             Self::Classic => "classic",
@@ -35,12 +35,12 @@ impl Mode {
         }
     }
 
-    /// Whether keys come from KMEs.
+    /// Returns whether keys come from KMEs.
     pub(crate) fn is_qkd(self) -> bool {
         self != Self::Classic
     }
 
-    /// The variables that select it.
+    /// Returns the variables that select the mode.
     pub(crate) fn settings(self) -> impl Iterator<Item = (&'static str, &'static str)> {
         let key_mode = match self {
             Self::Classic => None,

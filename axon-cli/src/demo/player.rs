@@ -1,4 +1,4 @@
-//! The demo's player: `axon play` that says its events and stays until it is released.
+//! The demo's player: `axon play` that reports events and stays until it is released.
 
 use std::{
     io::Read,
@@ -11,13 +11,13 @@ use axon_transport::qos::Qos;
 use super::events::Event;
 use crate::{cli, failure::CliError, log::Survey, logging, play, served::Served, session};
 
-/// How often it says how far it is.
+/// The time between two reports of progress.
 const REPORT: Duration = Duration::from_millis(200);
 
-/// Time that its publishers have to find their readers.
+/// The time in which its publishers have to find their readers.
 const MATCH: Duration = Duration::from_secs(35);
 
-/// Runs the player and says its events on standard output.
+/// Runs the player and writes its events to standard output.
 pub(crate) fn run(args: &cli::DemoPlayer) -> Result<(), CliError> {
     let config = logging::configure()?;
     let survey = Survey::of(&args.file).map_err(CliError::failed)?;
@@ -48,12 +48,12 @@ pub(crate) fn run(args: &cli::DemoPlayer) -> Result<(), CliError> {
         Ok(matches!(stopped.try_recv(), Err(mpsc::TryRecvError::Empty)))
     })?;
     Event::Sent { messages: sent.messages, waits: sent.waits }.say()?;
-    // The publishers live until the subscribers have what they sent.
+    // The publishers exist until the subscribers have received everything.
     let _ = stopped.recv();
     Ok(())
 }
 
-/// A channel that receives, or closes, when standard input ends.
+/// Returns a channel that receives a value, or closes, when standard input ends.
 pub(crate) fn end_of_stdin() -> mpsc::Receiver<()> {
     let (ended, receiver) = mpsc::channel();
     std::thread::spawn(move || {

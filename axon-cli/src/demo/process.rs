@@ -1,8 +1,9 @@
 //! Child processes that never outlive the demo.
 //!
-//! Each child's standard input is a pipe that the demo holds: a child ends when it closes, which
-//! the kernel sees to even when the demo itself is killed. Each child leads a process group of its
-//! own, so that an interrupt at the terminal reaches the demo alone and the children end in order.
+//! Each child's standard input is a pipe that the demo holds. A child ends when the pipe closes.
+//! The kernel closes it even when the demo itself is killed. Each child leads its own process
+//! group. An interrupt at the terminal therefore reaches only the demo, and the children end in
+//! order.
 
 use std::{
     fs::File,
@@ -19,10 +20,10 @@ use tokio::{
 
 use super::{DemoError, events::Event};
 
-/// How long a child has to end by itself.
+/// The time in which a child has to end by itself.
 const EXIT_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Longest piece of a log that goes into an error.
+/// The longest part of a log that an error quotes.
 const TAIL: usize = 600;
 
 /// A running child.
@@ -36,7 +37,7 @@ pub(crate) struct Process {
 }
 
 impl Process {
-    /// Starts `command`, its standard error going to `log`.
+    /// Starts `command`. Its standard error is appended to `log`.
     pub(crate) fn start(name: &str, mut command: Command, log: &Path) -> Result<Self, DemoError> {
         let failed = |source| DemoError::Start { name: name.to_owned(), source };
         let stderr = File::options().create(true).append(true).open(log).map_err(failed)?;
@@ -57,7 +58,8 @@ impl Process {
         })
     }
 
-    /// The next thing that the child says; an error when it ends or has failed. Cancel safe.
+    /// Returns the next event of the child. Returns an error if the child ended or failed. Cancel
+    /// safe.
     pub(crate) async fn event(&mut self) -> Result<Event, DemoError> {
         let Some(events) = &mut self.events else { return Err(self.ended()) };
         let Some(line) = events.next_line().await.unwrap_or(None) else {
@@ -75,18 +77,18 @@ impl Process {
         }
     }
 
-    /// An error when the child has ended.
+    /// Returns an error if the child has ended.
     pub(crate) fn check(&mut self) -> Result<(), DemoError> {
         if matches!(self.child.try_wait(), Ok(None)) { Ok(()) } else { Err(self.ended()) }
     }
 
-    /// An error for an event that was not its turn.
+    /// Returns an error for an event in the wrong order.
     pub(crate) fn unexpected(&self, event: &Event) -> DemoError {
         let reason = format!("said {event:?} out of turn");
         DemoError::Child { name: self.name.clone(), reason }
     }
 
-    /// An error for a child that was not `what` within `limit`.
+    /// Returns an error for a child that did not become `what` within `limit`.
     pub(crate) fn late(&self, what: &str, limit: Duration) -> DemoError {
         let tail = tail(&self.log).unwrap_or_default();
         let reason =
@@ -94,14 +96,14 @@ impl Process {
         DemoError::Child { name: self.name.clone(), reason }
     }
 
-    /// Lets the child end: its standard input closes.
+    /// Closes the child's standard input, so that the child ends.
     pub(crate) async fn release(&mut self) {
         if let Some(mut stdin) = self.stdin.take() {
             let _ = stdin.shutdown().await;
         }
     }
 
-    /// Ends the child: by itself when it does so in time, else killed.
+    /// Stops the child. A child that does not end in time is killed.
     pub(crate) async fn stop(mut self) {
         self.release().await;
         let _ = tokio::time::timeout(EXIT_TIMEOUT, self.child.wait()).await;
@@ -120,7 +122,8 @@ impl Process {
 
 impl Drop for Process {
     fn drop(&mut self) {
-        // Reaped here, so that nothing writes to the directory that is removed next.
+        // The child is killed and reaped here, so that it no longer writes to the directory, which
+        // is removed next.
         let _ = self.child.start_kill();
         let deadline = Instant::now() + Duration::from_secs(2);
         while matches!(self.child.try_wait(), Ok(None)) && Instant::now() < deadline {
@@ -129,7 +132,7 @@ impl Drop for Process {
     }
 }
 
-/// The end of a log, on one line.
+/// Returns the end of a log as one line.
 fn tail(log: &Path) -> io::Result<String> {
     let text = String::from_utf8_lossy(&std::fs::read(log)?).into_owned();
     let joined = text.lines().filter(|l| !l.trim().is_empty()).collect::<Vec<_>>().join(" | ");

@@ -1,4 +1,4 @@
-//! Progress on standard error: a bar on a terminal, else a line a step.
+//! Shows progress on standard error: a bar on a terminal, otherwise a line for each step.
 
 use std::{io::IsTerminal, time::Duration};
 
@@ -6,7 +6,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::say::say;
 
-/// The demo's progress.
+/// The progress of the demo.
 pub(crate) struct Progress {
     bar: ProgressBar,
     lines: bool,
@@ -14,7 +14,7 @@ pub(crate) struct Progress {
 }
 
 impl Progress {
-    /// Over `total` messages.
+    /// Starts the display for `total` messages.
     pub(crate) fn new(total: u64) -> Self {
         if !std::io::stderr().is_terminal() {
             return Self { lines: true, ..Self::hidden() };
@@ -29,12 +29,12 @@ impl Progress {
         Self { bar, lines: false, before: 0.into() }
     }
 
-    /// None at all.
+    /// Returns a display that shows nothing.
     pub(crate) fn hidden() -> Self {
         Self { bar: ProgressBar::hidden(), lines: false, before: 0.into() }
     }
 
-    /// What happens now.
+    /// Shows the current step.
     pub(crate) fn step(&self, what: &str, doing: &str) {
         if self.lines {
             say(format_args!("axon demo: {what}: {doing}"));
@@ -42,18 +42,18 @@ impl Progress {
         self.bar.set_message(format!("{what}: {doing}"));
     }
 
-    /// So many messages of the current replay arrived.
+    /// Shows how many messages of the current replay have arrived.
     pub(crate) fn received(&self, messages: u64) {
         self.bar.set_position(self.before.get() + messages);
     }
 
-    /// A replay of so many messages is over.
+    /// Adds a finished replay of this number of messages.
     pub(crate) fn finished(&self, messages: u64) {
         self.before.set(self.before.get() + messages);
         self.bar.set_position(self.before.get());
     }
 
-    /// Takes the bar off the screen.
+    /// Removes the bar from the screen.
     pub(crate) fn clear(&self) {
         self.bar.finish_and_clear();
     }

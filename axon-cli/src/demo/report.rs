@@ -7,39 +7,39 @@ use serde::Serialize;
 use super::{kmes::KeysHandedOut, route::Negotiated, tally::RunTally};
 use crate::text::{self, TextTable};
 
-/// Everything that the demo found out.
+/// All results of the demo.
 #[derive(Debug, Serialize)]
 pub(crate) struct Report {
-    /// What was replayed.
+    /// The log that was replayed.
     pub(crate) log: LogSummary,
-    /// A row a route.
+    /// One row for each route.
     pub(crate) routes: Vec<Row>,
-    /// An entry a wrong peer.
+    /// One entry for each wrong peer.
     pub(crate) wrong_peers: Vec<Attempt>,
-    /// Whether all is as it must be.
+    /// Whether every result is as required.
     pub(crate) passed: bool,
-    /// The last line.
+    /// The last line of the report.
     pub(crate) verdict: String,
 }
 
-/// What was replayed.
+/// The log that was replayed.
 #[derive(Debug, Serialize)]
 pub(crate) struct LogSummary {
-    /// File name.
+    /// The file name.
     pub(crate) file: String,
-    /// Topics with their types.
+    /// The topics with their types.
     pub(crate) topics: Vec<(String, String)>,
-    /// Number of messages.
+    /// The number of messages.
     pub(crate) messages: u64,
-    /// Their bytes.
+    /// The number of payload bytes.
     pub(crate) bytes: u64,
-    /// Recorded time in seconds.
+    /// The recorded time in seconds.
     pub(crate) seconds: f64,
-    /// Times the recorded pace.
+    /// The speed, as a multiple of the recorded pace.
     pub(crate) rate: f64,
 }
 
-/// One route.
+/// The result of one route.
 #[derive(Debug, Serialize)]
 pub(crate) struct Row {
     route: &'static str,
@@ -53,7 +53,7 @@ pub(crate) struct Row {
 }
 
 impl Row {
-    /// A row of what a subscriber found and what the link agreed on.
+    /// Makes a row from the outcome of a subscriber and the negotiated properties of the link.
     pub(crate) fn new(
         route: &'static str,
         outcome: RunTally,
@@ -105,21 +105,21 @@ impl Row {
     }
 }
 
-/// One wrong peer.
+/// The result of one wrong peer.
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct Attempt {
-    /// What tried to get in.
+    /// The description of the wrong peer.
     pub(crate) peer: &'static str,
     /// Whether it was refused.
     pub(crate) refused: bool,
-    /// The reason as the refused side was told.
+    /// The reason that the refused side received.
     pub(crate) told: String,
-    /// The reason as the daemon recorded it; none where no daemon is asked.
+    /// The reason that the daemon recorded. `None` if no daemon was asked.
     pub(crate) recorded: Option<String>,
 }
 
 impl Report {
-    /// A report with its verdict.
+    /// Makes a report with its verdict.
     pub(crate) fn new(log: LogSummary, routes: Vec<Row>, wrong_peers: Vec<Attempt>) -> Self {
         let mut faults: Vec<String> = routes.iter().filter_map(Row::fault).collect();
         let let_in = wrong_peers.iter().filter(|attempt| !attempt.refused);
@@ -143,7 +143,7 @@ impl Report {
         Self { log, routes, wrong_peers, passed, verdict }
     }
 
-    /// The report for people, its verdict last.
+    /// Returns the report as text, which ends with the verdict.
     pub(crate) fn render(&self) -> String {
         let mut out = String::new();
         let log = &self.log;

@@ -1,4 +1,4 @@
-//! One replay: a player and a subscriber on host A, a subscriber on host B.
+//! Replays a log once: a player and a subscriber on host A, a subscriber on host B.
 
 use std::{cell::Cell, ffi::OsString, path::Path, time::Duration};
 
@@ -17,38 +17,38 @@ use super::{
     tally::RunTally,
 };
 
-/// Time that a process has to get ready; bootstrap over slow KMEs included.
+/// The time in which a process has to get ready. It includes bootstrap with slow KMEs.
 const READY: Duration = Duration::from_secs(40);
 
-/// Time without a message after which a subscriber stops waiting for the rest.
+/// The time without a message after which a subscriber stops waiting for the rest.
 const SILENCE: Duration = Duration::from_secs(15);
 
 /// Two running hosts.
 #[derive(Debug)]
 pub(crate) struct Pair {
-    /// Where the log is played.
+    /// The host that publishes the log.
     pub(crate) a: Host,
-    /// Where it must arrive.
+    /// The host that receives the log.
     pub(crate) b: Host,
 }
 
-/// What is replayed.
+/// The log to replay, and its pace.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Replay<'a> {
     /// The log.
     pub(crate) file: &'a Path,
-    /// Times its recorded pace.
+    /// The speed, as a multiple of the recorded pace.
     pub(crate) rate: f64,
-    /// Its number of messages.
+    /// The number of messages in the log.
     pub(crate) messages: u64,
 }
 
-/// The outcomes of one replay.
+/// The results of one replay.
 #[derive(Debug)]
 pub(crate) struct Outcomes {
-    /// The subscriber on host A.
+    /// The result of the subscriber on host A.
     pub(crate) local: Row,
-    /// The subscriber on host B.
+    /// The result of the subscriber on host B.
     pub(crate) remote: Row,
 }
 
@@ -89,7 +89,7 @@ pub(crate) async fn run(
     )?;
     progress.finished(replay.messages);
 
-    // What was negotiated is read while the link that carried the messages still stands.
+    // The negotiated properties are read while the link that carried the messages still exists.
     let link = Negotiated::of(&pair.b.status().await?);
     for process in [player, local, remote] {
         process.stop().await;
@@ -102,12 +102,12 @@ pub(crate) async fn run(
     })
 }
 
-/// What the handshake of the link agreed on, as the daemon's status says.
+/// The properties that the link's handshake negotiated, as the daemon's status reports them.
 #[derive(Clone, Debug, PartialEq, Eq, serde::Serialize)]
 pub(crate) struct Negotiated {
-    /// Key exchange.
+    /// The key exchange.
     pub(crate) key_exchange: String,
-    /// Cipher.
+    /// The cipher.
     pub(crate) cipher: String,
 }
 
@@ -131,7 +131,7 @@ async fn ready(process: &mut Process) -> Result<(), DemoError> {
     }
 }
 
-/// Follows the player to the end of the log; how often it had to wait.
+/// Follows the player to the end of the log. Returns how often it had to wait.
 async fn play(player: &mut Process, sent: &Cell<Option<Instant>>) -> Result<u64, DemoError> {
     loop {
         match player.event().await? {
@@ -145,8 +145,8 @@ async fn play(player: &mut Process, sent: &Cell<Option<Instant>>) -> Result<u64,
     }
 }
 
-/// Follows a subscriber until it has the whole log, or nothing comes any more after the last
-/// message was sent.
+/// Follows a subscriber until it has the whole log, or until nothing more arrives for `SILENCE`
+/// after the last message was sent.
 async fn receive(
     subscriber: &mut Process,
     sent: &Cell<Option<Instant>>,
@@ -167,7 +167,7 @@ async fn receive(
             Err(_) => return Err(subscriber.late("heard of", SILENCE)),
         }
         if sent.get().is_some_and(|sent| sent.max(received.1).elapsed() > SILENCE) {
-            // The rest is lost: the subscriber says what it has.
+            // The other messages are lost. The subscriber reports those that it has.
             subscriber.release().await;
         }
     }

@@ -1,4 +1,5 @@
-//! The demo's subscriber: takes every topic of the log and compares what arrives with it.
+//! The demo's subscriber: subscribes to every topic of the log, and compares the received messages
+//! with the log.
 
 use std::{
     sync::mpsc,
@@ -15,13 +16,14 @@ use super::{
 };
 use crate::{cli, failure::CliError, log::Log, logging, session};
 
-/// How often it says how far it is.
+/// The time between two reports of progress.
 const REPORT: Duration = Duration::from_millis(200);
 
-/// Time that it goes on listening when everything has arrived: a repetition would come now.
+/// The time for which it continues to listen after everything has arrived. A repeated message would
+/// arrive in this time.
 const LISTEN_ON: Duration = Duration::from_millis(300);
 
-/// Runs the subscriber and says its events on standard output.
+/// Runs the subscriber and writes its events to standard output.
 pub(crate) fn run(args: &cli::DemoSubscriber) -> Result<(), CliError> {
     let config = logging::configure()?;
     let log = Log::load(&args.file).map_err(CliError::failed)?;

@@ -1,63 +1,63 @@
-//! What a subscriber counts: every message compared with the log, byte for byte.
+//! Counts the messages that a subscriber receives, and compares each with the log byte for byte.
 
 use serde::{Deserialize, Serialize};
 
-/// The outcome of one subscriber's run.
+/// The result of one subscriber's run.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct RunTally {
     /// Messages of the log that should arrive.
     pub(crate) expected: u64,
     /// Messages of the log that arrived, each counted once.
     pub(crate) messages: u64,
-    /// Their payload bytes.
+    /// Payload bytes of these messages.
     pub(crate) bytes: u64,
     /// Messages of the log that did not arrive.
     pub(crate) lost: u64,
-    /// Messages that arrived behind a later one of their publisher.
+    /// Messages that arrived after a later message of the same publisher.
     pub(crate) out_of_order: u64,
-    /// Messages that arrived again.
+    /// Messages that arrived more than once.
     pub(crate) duplicates: u64,
     /// Messages whose bytes differ from the log, or that the log does not hold.
     pub(crate) different: u64,
     /// Median of the time from publish to receipt, in nanoseconds.
     pub(crate) latency_p50_ns: u64,
-    /// 99th percentile of the same.
+    /// The 99th percentile of the same time.
     pub(crate) latency_p99_ns: u64,
-    /// Largest of the same.
+    /// The maximum of the same time.
     pub(crate) latency_max_ns: u64,
     /// Time from the first publish to the last receipt, in nanoseconds.
     pub(crate) elapsed_ns: u64,
 }
 
 impl RunTally {
-    /// Whether the whole log arrived once, in order and unchanged.
+    /// Returns whether the whole log arrived once, in order and unchanged.
     pub(crate) fn is_whole(&self) -> bool {
         let faults = [self.lost, self.out_of_order, self.duplicates, self.different];
         self.expected > 0 && self.messages == self.expected && faults == [0; 4]
     }
 
-    /// Payload bytes per second of the run.
+    /// Returns the payload bytes per second of the run.
     pub(crate) fn bytes_per_second(&self) -> f64 {
         if self.elapsed_ns == 0 { 0.0 } else { self.bytes as f64 * 1e9 / self.elapsed_ns as f64 }
     }
 }
 
-/// One message as it came from a subscription.
+/// One message that a subscription received.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Arrival<'a> {
-    /// Index of its topic in the log.
+    /// The index of the topic in the log.
     pub(crate) topic: usize,
-    /// Sequence number of its publication, from 1.
+    /// The publication sequence number, from 1.
     pub(crate) sequence: u64,
-    /// When it was published, in nanoseconds since the Unix epoch.
+    /// The time of publication, in nanoseconds since the Unix epoch.
     pub(crate) published: i64,
-    /// When it was taken.
+    /// The time at which it was taken, in nanoseconds since the Unix epoch.
     pub(crate) received: i64,
-    /// Its bytes.
+    /// The payload.
     pub(crate) payload: &'a [u8],
 }
 
-/// Compares arrivals with the log as they come.
+/// Compares messages with the log as they arrive.
 #[derive(Debug)]
 pub(crate) struct Tally {
     topics: Vec<TopicTally>,
@@ -75,7 +75,7 @@ struct TopicTally {
 }
 
 impl Tally {
-    /// A tally over the payloads of each topic.
+    /// Creates a tally for the payloads of each topic.
     pub(crate) fn new(payloads: Vec<Vec<Vec<u8>>>) -> Self {
         let expected = payloads.iter().map(Vec::len).sum();
         let topic = |payloads: Vec<Vec<u8>>| TopicTally {
@@ -125,17 +125,17 @@ impl Tally {
         *last = (*last).max(arrival.received);
     }
 
-    /// Messages of the log that arrived so far.
+    /// Returns how many messages of the log have arrived so far.
     pub(crate) fn messages(&self) -> u64 {
         self.outcome.messages
     }
 
-    /// Whether every message of the log has arrived.
+    /// Returns whether every message of the log has arrived.
     pub(crate) fn is_complete(&self) -> bool {
         self.outcome.messages == self.outcome.expected
     }
 
-    /// The outcome, now that nothing more is awaited.
+    /// Returns the result. Messages that have not arrived count as lost.
     pub(crate) fn finish(mut self) -> RunTally {
         self.latencies.sort_unstable();
         self.outcome.lost = self.outcome.expected - self.outcome.messages;
@@ -149,7 +149,8 @@ impl Tally {
     }
 }
 
-/// The value that `percent` of the sorted values do not exceed (nearest rank); 0 of none.
+/// Returns the smallest of the sorted values that at least `percent` of them do not exceed (nearest
+/// rank). Returns 0 if there are no values.
 fn percentile(sorted: &[u64], percent: usize) -> u64 {
     let rank = (sorted.len() * percent).div_ceil(100);
     sorted.get(rank.saturating_sub(1)).copied().unwrap_or(0)

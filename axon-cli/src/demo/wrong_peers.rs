@@ -1,4 +1,4 @@
-//! Peers that must not get in: each a real attempt against the running daemon of host B.
+//! Peers that must be refused. Each one is a real attempt against the running daemon of host B.
 
 use std::{
     ffi::OsString,
@@ -24,20 +24,20 @@ use super::{
 };
 use crate::log::Topic;
 
-/// Host B.
+/// The address of host B.
 const TARGET: Ipv4Addr = Ipv4Addr::new(127, 0, 0, 2);
 
-/// Where the attempts come from.
+/// The address from which the attempts come.
 const VISITOR: &str = "127.0.0.1";
 
-/// Time that the daemon has to record a refusal.
+/// The time in which the daemon has to record a refusal.
 const RECORD: Duration = Duration::from_secs(5);
 
-/// Time for a daemon to refuse its settings.
+/// The time in which a daemon has to refuse its settings.
 const REFUSAL: Duration = Duration::from_secs(10);
 
-/// What is tried, and the name of the one refusal that answers it: a TLS alert, or the close code
-/// of a link (`docs/formats.md`, section 6). Refused for another reason is not refused for this.
+/// An attempt, and the name of the one refusal that is correct for it: a TLS alert, or the close
+/// code of a link (`docs/formats.md`, section 6). A refusal for another reason does not count.
 #[derive(Clone, Copy, Debug)]
 struct Wrong {
     peer: &'static str,
@@ -60,20 +60,20 @@ const REPLAYED: Wrong = Wrong { peer: "a replayed envelope", refusal: "ENVELOPE_
 
 /// Attempts against one host.
 pub(crate) struct Visit<'a> {
-    /// The mode of the host.
+    /// The security mode of the host.
     pub(crate) mode: Mode,
     /// The host.
     pub(crate) host: &'a Host,
     /// The KMEs.
     pub(crate) kmes: &'a Kmes,
-    /// A directory for what an attempt keeps.
+    /// A directory for the files of an attempt.
     pub(crate) dir: &'a Path,
-    /// A topic to send envelopes on.
+    /// The topic on which envelopes are sent.
     pub(crate) topic: &'a Topic,
 }
 
 impl Visit<'_> {
-    /// Makes every attempt that this mode is the target of.
+    /// Makes every attempt against this mode.
     pub(crate) async fn all(&self) -> Result<Vec<Attempt>, DemoError> {
         match self.mode {
             Mode::Classic => Ok(vec![self.classical_groups().await?]),
@@ -103,7 +103,7 @@ impl Visit<'_> {
         self.attempt(wrong, told, &before).await
     }
 
-    /// A dial as a daemon of `mode` makes it.
+    /// Connects as a daemon of `mode` does.
     async fn link(
         &self,
         wrong: Wrong,
@@ -118,8 +118,9 @@ impl Visit<'_> {
         self.judge(wrong, outcome.map(drop), &before).await
     }
 
-    /// Envelopes over a link that is as it should be. That an honest one is taken, on a link made
-    /// in the same way, shows that the others are refused for what was done to them.
+    /// Sends envelopes over a correct link. The daemon first accepts an honest envelope on a link
+    /// that is made in the same way. This shows that the other envelopes are refused because of the
+    /// change made to them.
     async fn envelopes(&self) -> Result<Vec<Attempt>, DemoError> {
         let reader = self.host.spawn("reader of the envelopes", &self.reader())?;
         let honest = "an honest envelope";
@@ -137,7 +138,8 @@ impl Visit<'_> {
         Ok(attempts)
     }
 
-    /// The daemon's answer to one envelope; an error when there is no link to send it on.
+    /// Returns the daemon's answer to one envelope. Returns an error if no link can be made to send
+    /// it.
     async fn envelope(
         &self,
         peer: &'static str,
@@ -171,7 +173,7 @@ impl Visit<'_> {
                 let reason = format!("{}: {}", refusal.name, refusal.reason);
                 Some((refusal.name == wrong.refusal, reason))
             }
-            // Then it is not the daemon that refused.
+            // In this case the daemon did not refuse.
             Err(refusal) => {
                 let reason = refusal.to_string();
                 return Err(DemoError::Attempt { attempt: wrong.peer, reason });
@@ -180,8 +182,8 @@ impl Visit<'_> {
         self.attempt(wrong, told, before).await
     }
 
-    /// `told`: whether the refusal has the right name, and its words. Refused is who was told so
-    /// and of whom the daemon's own record says the same.
+    /// Judges an attempt. `told` holds whether the refusal has the right name, and its text. A peer
+    /// counts as refused only if it was told so and the daemon recorded the same refusal.
     async fn attempt(
         &self,
         wrong: Wrong,
@@ -198,7 +200,7 @@ impl Visit<'_> {
         Ok(Attempt { peer: wrong.peer, refused, told, recorded: Some(recorded) })
     }
 
-    /// The daemon's record of a refusal with this name that is not among those `before`.
+    /// Returns the daemon's record of a refusal with this name that is not in `before`.
     async fn recorded(&self, refusal: &str, before: &[Value]) -> Result<Option<String>, DemoError> {
         let deadline = Instant::now() + RECORD;
         loop {
@@ -228,7 +230,7 @@ impl Visit<'_> {
         Ok((TARGET, port.ok_or_else(none)?).into())
     }
 
-    /// The settings of a daemon of `mode` that host B would take as a peer.
+    /// Returns the settings of a daemon of `mode` that host B would accept as a peer.
     fn visitor(&self, peer: &'static str, mode: Mode) -> Result<Config, DemoError> {
         let spec = HostSpec {
             name: "the visitor",
@@ -246,14 +248,14 @@ impl Visit<'_> {
     }
 }
 
-/// A command under a variable that AXON no longer takes.
+/// Runs a command with a variable that AXON no longer accepts.
 pub(crate) async fn obsolete_variable() -> Result<Attempt, DemoError> {
     let peer = "an obsolete variable";
     let settings = [("AXON_SECURITY_PROFILE".to_owned(), "classic".into())];
     let mut command = axon(&settings)?;
     command.arg("daemon").kill_on_drop(true);
     let failed = |reason: String| DemoError::Attempt { attempt: peer, reason };
-    // A daemon that took the variable would stay.
+    // A daemon that accepted the variable would continue to run.
     let output = tokio::time::timeout(REFUSAL, command.output())
         .await
         .map_err(|_| failed("a daemon was started with it".to_owned()))?

@@ -1,39 +1,39 @@
-//! Which part of an MCAP log a checksum covers.
+//! Determines which part of an MCAP log a checksum covers.
 //!
-//! MCAP has a checksum for each chunk, and one at the end for the whole data section. A zero stands for
-//! "none".
+//! MCAP has a checksum for each chunk, and one at the end for the whole data section. Zero means that there is no
+//! checksum.
 
 use mcap::{MAGIC, records::op};
 
-/// Operation code and length of a record.
+/// The length of a record's operation code and length field.
 const HEAD: usize = 9;
-/// Where the checksum of a chunk begins in its body: after two times and the uncompressed length.
+/// The offset of the checksum in the body of a chunk, after two times and the uncompressed length.
 const CHUNK_CHECKSUM: usize = 24;
 const CHECKSUM: usize = 4;
 
-/// Follows the records of a log that a reader takes.
+/// Follows the records of a log as a reader reads them.
 ///
-/// The reader asks for no byte beyond the record that it reads. The record that began last is therefore
-/// that of the message that it hands out.
+/// The reader requests no byte beyond the current record. The record that began last is therefore the record of the
+/// message that the reader returns.
 #[derive(Debug, Default)]
 pub(super) struct Coverage {
-    /// Bytes of the magic that came, as long as they are right.
+    /// The number of bytes of the magic number read so far.
     magic: usize,
     no_log: bool,
     head: Vec<u8>,
-    /// The body's bytes up to the end of its checksum, where its record has one.
+    /// The first bytes of the body. They include the checksum of a chunk or of the data section.
     body: Vec<u8>,
-    /// Bytes of the record that are still to come.
+    /// The number of bytes of the record that are still to come.
     left: u64,
-    /// A schema or a channel stood outside chunks: topics of messages depend on it.
+    /// A schema or a channel was outside chunks, and topics of messages depend on it.
     names_outside: bool,
-    /// Messages that no checksum of a chunk covers.
+    /// Messages that no chunk's checksum covers.
     unchecked: u64,
     end: Option<u32>,
 }
 
 impl Coverage {
-    /// Takes the next bytes of the log.
+    /// Processes the next bytes of the log.
     pub(super) fn read(&mut self, mut bytes: &[u8]) {
         while let [first, rest @ ..] = bytes {
             if self.magic < MAGIC.len() {
@@ -62,12 +62,12 @@ impl Coverage {
         }
     }
 
-    /// Whether the log begins as an MCAP log does.
+    /// Returns whether the log begins with the magic number of MCAP.
     pub(super) fn is_log(&self) -> bool {
         self.magic == MAGIC.len() && !self.no_log
     }
 
-    /// Counts a message that the reader hands out.
+    /// Counts a message that the reader returns.
     pub(super) fn message(&mut self) {
         let at = CHUNK_CHECKSUM..CHUNK_CHECKSUM + CHECKSUM;
         let chunk = matches!(self.whole_head(), Some((op::CHUNK, _)));
@@ -75,11 +75,10 @@ impl Coverage {
         self.unchecked += u64::from(self.names_outside || !(chunk && checksum));
     }
 
-    /// How many of the messages that were handed out no checksum covers, where the reader ended with
-    /// this error.
+    /// Returns how many of the returned messages no checksum covers, if the reader ended with `error`.
     pub(super) fn unverified(&self, error: &mcap::McapError) -> u64 {
         let mismatch = matches!(error, mcap::McapError::BadDataCrc { .. });
-        // The reader compares it before it goes on.
+        // The reader compares the checksum of the data section before it continues.
         let section = self.end.is_some_and(|checksum| checksum != 0) && !mismatch;
         if section { 0 } else { self.unchecked }
     }

@@ -1,7 +1,7 @@
-//! Recorded logs: MCAP in, topics and messages out.
+//! Recorded logs: reads topics and messages from MCAP files.
 //!
-//! A file is read as a stream, so memory follows its largest chunk and not its size; [`Log::load`]
-//! alone holds a whole log, for comparisons.
+//! A file is read as a stream, so the memory used depends on the largest chunk and not on the size
+//! of the file. Only [`Log::load`] holds a whole log, for comparisons.
 
 mod coverage;
 
@@ -18,62 +18,62 @@ use mcap::{
 
 use coverage::Coverage;
 
-/// Longest record that is read, in bytes: no message may be larger on the wire either.
+/// The longest record that is read, in bytes. A message on the wire must not be larger either.
 const RECORD_LIMIT: usize = 1 << 30;
 
-/// What was recorded under one topic name and one type.
+/// A recorded topic: one name and one type.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Topic {
-    /// Topic name as recorded.
+    /// The topic name as recorded.
     pub(crate) name: String,
-    /// Type name as ROS spells it, such as `sensor_msgs/msg/LaserScan`.
+    /// The type name as ROS writes it, such as `sensor_msgs/msg/LaserScan`.
     pub(crate) type_name: String,
 }
 
 /// One recorded message.
 #[derive(Debug)]
 pub(crate) struct Message {
-    /// Index into the log's topics.
+    /// The index into the log's topics.
     pub(crate) topic: usize,
-    /// When it was recorded, in nanoseconds of the recorder's clock.
+    /// The time of recording, in nanoseconds of the recorder's clock.
     pub(crate) time: u64,
     /// The serialized message.
     pub(crate) data: Vec<u8>,
 }
 
-/// What a log holds, without its messages.
+/// The contents of a log, without its messages.
 #[derive(Clone, Debug)]
 pub(crate) struct Survey {
-    /// Where the log is.
+    /// The path of the log.
     pub(crate) path: PathBuf,
-    /// Topics, in the order of their first message.
+    /// The topics, in the order of their first messages.
     pub(crate) topics: Vec<Topic>,
-    /// Number of messages.
+    /// The number of messages.
     pub(crate) messages: u64,
-    /// Sum of the messages' sizes in bytes.
+    /// The sum of the messages' sizes in bytes.
     pub(crate) bytes: u64,
-    /// Largest message in bytes.
+    /// The size of the largest message in bytes.
     pub(crate) largest: u64,
-    /// Time from the earliest to the latest message, in nanoseconds.
+    /// The time from the earliest to the latest message, in nanoseconds.
     pub(crate) duration: u64,
-    /// What ends the log early, where only its whole part was asked for.
+    /// The damage that ends the log early, if only the part before it was requested.
     pub(crate) damage: Option<String>,
     /// Messages of a damaged log that no checksum covers.
     pub(crate) unverified: u64,
 }
 
-/// What is read of a damaged log.
+/// The part of a damaged log that is read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Part {
-    /// Nothing.
+    /// Nothing: a damaged log is an error.
     Nothing,
-    /// What precedes the damage, if a checksum covers all of it.
+    /// The messages before the damage, if a checksum covers all of them.
     Verified,
-    /// What precedes the damage.
+    /// The messages before the damage, verified or not.
     Unverified,
 }
 
-/// Why a log cannot be read.
+/// The reason why a log cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum LogError {
     #[error("cannot open the log {path}: {source}")]
@@ -90,7 +90,7 @@ pub(crate) enum LogError {
     Empty { path: PathBuf },
 }
 
-/// What can be had of a damaged log.
+/// Describes which part of a damaged log can be read.
 fn whole(messages: u64, unverified: u64, seconds: f64) -> String {
     match (messages, unverified) {
         (0, _) => "no message before that is whole".to_owned(),
@@ -106,18 +106,19 @@ fn whole(messages: u64, unverified: u64, seconds: f64) -> String {
 }
 
 impl Survey {
-    /// Reads the log once from end to end, checksums included.
+    /// Reads the log once from start to end and verifies its checksums.
     ///
     /// # Errors
-    /// [`LogError::Damaged`] where a part of the log is missing or fails its checksum.
+    /// [`LogError::Damaged`] if a part of the log is missing or does not match its checksum. Other
+    /// errors if the file cannot be read, is no MCAP log, or holds no messages.
     pub(crate) fn of(path: &Path) -> Result<Self, LogError> {
         Self::of_part(path, Part::Nothing)
     }
 
-    /// As [`Survey::of`], but of a damaged log this part.
+    /// As [`Survey::of`], but reads this part of a damaged log.
     ///
     /// # Errors
-    /// [`LogError::Damaged`] where the log is damaged and that part is not to be had.
+    /// [`LogError::Damaged`] if the log is damaged and `part` cannot be read from it.
     pub(crate) fn of_part(path: &Path, part: Part) -> Result<Self, LogError> {
         let (mut survey, damage) = Self::read(path)?;
         let Some(source) = damage else {
@@ -145,7 +146,7 @@ impl Survey {
         })
     }
 
-    /// The messages before the first damage, and the damage.
+    /// Reads the messages before the first damage. Returns the damage, too.
     fn read(path: &Path) -> Result<(Self, Option<McapError>), LogError> {
         let mut survey = Self {
             path: path.to_owned(),
@@ -182,7 +183,8 @@ impl Survey {
         Ok((survey, damage))
     }
 
-    /// The surveyed messages in the order of the file, with indexes into this survey's topics.
+    /// Returns the surveyed messages in the order of the file, with indexes into this survey's
+    /// topics.
     pub(crate) fn messages(
         &self,
     ) -> Result<impl Iterator<Item = Result<Message, LogError>> + Send + use<>, LogError> {
@@ -207,9 +209,9 @@ impl Survey {
 /// A whole log in memory.
 #[derive(Debug)]
 pub(crate) struct Log {
-    /// What it holds.
+    /// The contents without the messages.
     pub(crate) survey: Survey,
-    /// For each topic its messages, in the order of the file.
+    /// The messages of each topic, in the order of the file.
     pub(crate) payloads: Vec<Vec<Vec<u8>>>,
 }
 
@@ -226,21 +228,21 @@ impl Log {
     }
 }
 
-/// Which checksums are compared.
+/// The checksums that are compared.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Checks {
-    /// Of each chunk, before its first message is handed out.
+    /// The checksum of each chunk, before its first message is returned.
     Chunks,
-    /// Those of the chunks, and that of the data section.
+    /// The checksums of the chunks and of the data section.
     Whole,
 }
 
-/// Why no further message can be read.
+/// The reason why no further message can be read.
 #[derive(Debug)]
 enum End {
     /// The file cannot be read.
     Read(std::io::Error),
-    /// It can, and is no whole log.
+    /// The file can be read, but the log is not complete.
     Damage(McapError),
 }
 
@@ -269,7 +271,7 @@ impl Messages {
         })
     }
 
-    /// The next message, or none at the end of a whole log.
+    /// Returns the next message, or `None` at the end of a complete log.
     fn advance(&mut self) -> Result<Option<Message>, End> {
         let message = loop {
             match self.reader.next_event().transpose().map_err(End::Damage)? {

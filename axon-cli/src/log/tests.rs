@@ -95,10 +95,10 @@ fn messages_that_no_checksum_covers_are_not_called_whole() {
     let whole = without_chunks(10, true);
     assert_eq!(Survey::of(file(&whole).path()).expect("a whole log").messages, 10);
     let mut flipped = whole.clone();
-    // A message's payload follows its channel, its number and two times.
+    // A message's payload follows its channel, its sequence number and two times.
     let payload = record(&flipped, op::MESSAGE, 7) + 2 + 4 + 8 + 8;
     flipped[payload] ^= 1;
-    // One without any checksum that has lost its end, and one whose checksum did not come to be compared.
+    // The first log has no checksum and has lost its end. The second is cut before its checksum.
     let none = without_chunks(10, false);
     let cuts = [&none[..none.len() - 1], &whole[..whole.len() / 2]];
     for bytes in [&flipped[..], cuts[0], cuts[1]] {
@@ -120,18 +120,18 @@ fn messages_that_no_checksum_covers_are_not_called_whole() {
 
 #[test]
 fn a_verified_checksum_covers_the_records_before_it() {
-    // Damage behind the data section, of a log without chunks: that section was compared before.
+    // The log has no chunks, and it is damaged after the data section, whose checksum was compared before.
     let whole = without_chunks(10, true);
     let cut = file(&whole[..whole.len() - 1]);
     assert_eq!(Survey::of_part(cut.path(), Part::Verified).expect("verified").messages, 10);
-    // A wrong checksum of the data section, of a log whose chunks are right.
+    // The checksum of the data section is wrong, and the chunks are correct.
     let mut bytes = chunks_of_ten(3, None);
     let end = record(&bytes, op::DATA_END, 0);
     bytes[end] ^= 1;
     let chunks = file(&bytes);
     let part = Survey::of_part(chunks.path(), Part::Verified).expect("verified by chunks");
     assert!(part.messages == 30 && part.damage.is_some(), "{part:?}");
-    // The same, but the second chunk has no checksum of its own.
+    // The log is the same, but the second chunk has no checksum.
     let second = record(&bytes, op::CHUNK, 1);
     bytes[second + 24..second + 28].fill(0);
     let error = Survey::of_part(file(&bytes).path(), Part::Verified).expect_err("ten are not");
@@ -156,19 +156,19 @@ fn a_log_that_shrinks_between_survey_and_replay_is_an_error() {
     assert!(read.last().expect("an error").is_err());
 }
 
-/// A log of `count` chunks with ten messages each.
+/// Returns a log of `count` chunks with ten messages each.
 fn chunks_of_ten(count: u64, compression: Option<mcap::Compression>) -> Vec<u8> {
     let options = mcap::WriteOptions::new().compression(compression);
     written(options.calculate_data_section_crc(true), count * 10)
 }
 
-/// A log of `count` messages that are in no chunk.
+/// Returns a log of `count` messages that are in no chunk.
 fn without_chunks(count: u64, checksum: bool) -> Vec<u8> {
     let options = mcap::WriteOptions::new().use_chunks(false);
     written(options.calculate_data_section_crc(checksum), count)
 }
 
-/// A log of `count` messages, ten in each chunk if it has chunks.
+/// Returns a log of `count` messages, with ten in each chunk if it has chunks.
 fn written(options: mcap::WriteOptions, count: u64) -> Vec<u8> {
     let mut writer = options.create(std::io::Cursor::new(Vec::new())).expect("writer");
     let channel = writer.add_channel(0, "/t", "cdr", &BTreeMap::new()).expect("channel");
@@ -188,12 +188,12 @@ fn written(options: mcap::WriteOptions, count: u64) -> Vec<u8> {
     writer.into_inner().into_inner()
 }
 
-/// Where the body of the chunk of this index begins.
+/// Returns the offset of the body of chunk `index`.
 fn chunk_header(bytes: &[u8], index: usize) -> usize {
     record(bytes, op::CHUNK, index)
 }
 
-/// Where the body of a record begins: of the one of this index among those with this operation code.
+/// Returns the offset of the body of record `index` among the records with operation code `code`.
 fn record(bytes: &[u8], code: u8, index: usize) -> usize {
     let mut at = mcap::MAGIC.len();
     let mut seen = 0;

@@ -1,4 +1,4 @@
-//! `axon status`: what the daemon says of itself, as tables.
+//! `axon status`: shows the daemon's status as tables.
 
 mod paths;
 
@@ -24,9 +24,9 @@ use crate::{
 /// Runs `axon status`.
 ///
 /// # Errors
-/// A setting by which the daemon is found; or what it answers cannot be shown.
+/// A setting that locates the daemon is wrong, or the daemon's answer cannot be shown.
 pub(crate) fn run(args: &cli::Status) -> Result<ExitCode, CliError> {
-    // Whatever is wrong with this host's settings and files: a daemon that runs can be looked at.
+    // The status of a running daemon is shown even if this host's settings or files are wrong.
     let wrong = match logging::configure().and_then(|config| Ok(config.with_rules_of_host()?)) {
         Ok(config) => {
             if let Some(line) = config.unknown_variables() {
@@ -45,7 +45,7 @@ pub(crate) fn run(args: &cli::Status) -> Result<ExitCode, CliError> {
                 let said = failure.report();
                 return Ok(status.unwrap_or(said));
             }
-            // It was said: no other setting is worth a second line.
+            // The first error was already reported, so a second setting is not reported.
             Err(error) => return status.ok_or(error.into()),
         };
     let text = if args.json {
@@ -59,11 +59,11 @@ pub(crate) fn run(args: &cli::Status) -> Result<ExitCode, CliError> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Printed in place of the details that the daemon does not tell another user.
+/// The text that replaces the details that the daemon does not report to another user.
 const WITHHELD: &str = "\nThe daemon belongs to another user and has access rules: it tells no other user its settings, \
                         rules, links, topics and sessions. Its own user sees them with `axon status`.\n";
 
-/// The status for people.
+/// Formats the status as text.
 fn render(status: &Status) -> String {
     let mut out = String::new();
     heading(&mut out, "Daemon");
@@ -129,7 +129,7 @@ fn mode(status: &Status) -> String {
     format!("{} ({}){sae}", status.mode, details.join(", "))
 }
 
-/// Where the access rules are that the daemon has in force.
+/// Returns the file of the access rules that the daemon has in force.
 fn access_rules(status: &Status) -> String {
     match (status.settings.get("AXON_ACCESS_FILE"), &status.access_digest) {
         (Some(file), Some(digest)) => format!("{file}, digest {digest}"),
@@ -138,7 +138,7 @@ fn access_rules(status: &Status) -> String {
     }
 }
 
-/// How many descriptors the daemon has of those that it may have.
+/// Returns how many descriptors the daemon has open, and its limit.
 fn descriptors(status: &Status) -> String {
     let Some(shown) = status.descriptors else { return "not told".to_owned() };
     let limit = shown.limit.map_or_else(|| "any number".to_owned(), |limit| limit.to_string());
@@ -149,7 +149,7 @@ fn descriptors(status: &Status) -> String {
     format!("{} open of {limit}{refused}", shown.open)
 }
 
-/// How far the daemon looks for other hosts, and for which by name.
+/// Returns the discovery range of the daemon, and the hosts that it looks for by name.
 fn discovery(status: &Status) -> String {
     let looks = &status.discovery;
     if looks.hosts.is_empty() {
@@ -203,7 +203,8 @@ fn routes_refused(links: &[LinkStatus]) -> TextTable {
     reasons(links, "topic", |link| (&link.routes_refused, link.more_routes_refused))
 }
 
-/// A row for each name and reason of each link, and one for those that a link does not list.
+/// Returns one row for each name and reason of each link, and one row for those that a link does
+/// not list.
 fn reasons<'a>(
     links: &'a [LinkStatus],
     column: &'static str,
@@ -256,7 +257,7 @@ fn causes(dropped: &BTreeMap<String, u64>) -> String {
     if causes.is_empty() { "0".to_owned() } else { causes.join(", ") }
 }
 
-/// The key supply comes as the gateway describes it: every value under its path.
+/// Shows the key supply as the gateway describes it, with each value under its path.
 fn keys(out: &mut String, keys: &Value) {
     let mut table = TextTable::new(&["of", ">value"]);
     flatten(&mut table, "", keys);
@@ -316,7 +317,7 @@ fn topics(status: &Status) -> TextTable {
     table
 }
 
-/// The depths of the publishers here: one, or from the least to the most.
+/// Returns the depth of the publishers here: one value, or a range.
 fn depth(topic: &TopicStatus) -> String {
     let depths = topic.writers.iter().map(|writer| writer.depth.map_or(u64::MAX, u64::from));
     let name = |depth| if depth == u64::MAX { "all".to_owned() } else { grouped(depth) };
@@ -327,7 +328,8 @@ fn depth(topic: &TopicStatus) -> String {
     }
 }
 
-/// Processes with a reader that leaves samples lie, and for how long the oldest has lain.
+/// Returns the processes with a reader that does not take its samples, and how long the oldest
+/// sample has waited.
 fn stalled(topic: &TopicStatus) -> String {
     let mut longest: BTreeMap<u32, (Duration, bool)> = BTreeMap::new();
     for reader in topic.readers.iter().filter(|reader| reader.is_stalled()) {
@@ -354,7 +356,7 @@ fn sessions(status: &Status) -> TextTable {
     table
 }
 
-/// A session's discovery range and static peers, and which of the linked hosts those are.
+/// Returns a session's discovery range and static peers, and which linked hosts are static peers.
 fn range(session: &SessionStatus, links: &[LinkStatus]) -> String {
     let Some(range) = &session.range else { return dash() };
     let mut text = range.clone();
@@ -388,7 +390,7 @@ fn out_of_range(status: &Status) -> TextTable {
     table
 }
 
-/// The endpoints to or from which nothing flows since a route is refused.
+/// Returns the endpoints that exchange no data because a route was refused.
 fn refused(status: &Status) -> TextTable {
     let mut table = TextTable::new(&["topic", "endpoint", "host", "why"]);
     for topic in &status.topics {
@@ -404,7 +406,8 @@ fn refused(status: &Status) -> TextTable {
     table
 }
 
-/// Whether a session shares memory, and if not why, and what that costs.
+/// Returns whether a session shares memory. If it does not, returns the reason and the relayed
+/// traffic.
 fn memory(relay: Option<&RelayStatus>) -> String {
     let Some(relay) = relay else { return "shared".to_owned() };
     let traffic = |samples, bytes| format!("{} ({})", grouped(samples), text::bytes(bytes));
@@ -454,7 +457,8 @@ fn section(out: &mut String, title: &str, none: &str, table: TextTable) {
     }
 }
 
-/// For the writer of durations, which takes no longer ones than of some centuries.
+/// Converts a time for `text::duration`. A time that does not fit becomes the longest one, which is
+/// some centuries.
 fn nanoseconds(time: Duration) -> u64 {
     u64::try_from(time.as_nanos()).unwrap_or(u64::MAX)
 }

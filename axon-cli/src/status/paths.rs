@@ -1,4 +1,5 @@
-//! What a link's QUIC connection measures and what waits for it: why a link is slow.
+//! Shows the measurements of a link's QUIC connection and its waiting data, which explain why a
+//! link is slow.
 
 use std::time::Duration;
 
@@ -7,7 +8,7 @@ use axon_transport::status::{CompressedStatus, LinkStatus, StandbyStatus, Waitin
 use super::{dash, nanoseconds};
 use crate::text::{self, TextTable, grouped};
 
-/// A row for each link.
+/// Returns a row for each link.
 pub(super) fn paths(links: &[LinkStatus]) -> TextTable {
     let mut table = TextTable::new(&[
         "host",
@@ -45,14 +46,14 @@ pub(super) fn paths(links: &[LinkStatus]) -> TextTable {
     table
 }
 
-/// The address of the link that stands by, and its round trip.
+/// Returns the address of the standby link and its round-trip time.
 fn second_path(standby: Option<&StandbyStatus>) -> String {
     standby.map_or_else(dash, |standby| {
         format!("{}, {}", standby.address, text::duration(nanoseconds(standby.rtt)))
     })
 }
 
-/// How many samples were compressed, and their bytes before and after.
+/// Returns how many samples were compressed, and their bytes before and after compression.
 fn compressed(compressed: &CompressedStatus) -> String {
     let CompressedStatus { samples, bytes, bytes_sent, .. } = *compressed;
     if samples == 0 {
@@ -61,7 +62,7 @@ fn compressed(compressed: &CompressedStatus) -> String {
     format!("{}: {} to {}", grouped(samples), text::bytes(bytes), text::bytes(bytes_sent))
 }
 
-/// The classes of which something waits, in the order in which they are served.
+/// Returns the classes with waiting data, in the order in which they are served.
 fn waiting(waiting: &WaitingStatus) -> String {
     let WaitingStatus { control, services, small_reliable, small_best_effort, bulk, .. } = *waiting;
     let classes = [

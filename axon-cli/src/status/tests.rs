@@ -1,4 +1,4 @@
-//! Tests what is shown of a status.
+//! Tests the text that shows a status.
 
 use std::time::SystemTime;
 
@@ -98,7 +98,7 @@ fn link() -> LinkStatus {
     link
 }
 
-/// A reader of a stopped process, which has left a sample for so long.
+/// Returns a reader of a stopped process whose oldest sample has waited for `waiting_ms`.
 fn reader(pid: u32, waiting_ms: u64) -> ReaderStatus {
     let mut reader = ReaderStatus::default();
     reader.pid = pid;

@@ -1,4 +1,4 @@
-//! What can be typed after `axon trust`.
+//! The arguments of `axon trust`.
 
 use std::path::PathBuf;
 

@@ -1,4 +1,4 @@
-//! The files of a pinned host. Every failure names the file.
+//! Reads the files of a pinned host. Each failure names the file.
 
 use std::{
     fs::File,
@@ -11,10 +11,10 @@ use zeroize::Zeroizing;
 
 use crate::failure::CliError;
 
-/// Larger than any key in PEM.
+/// The size of the buffer for a key, larger than any key in PEM.
 const LARGEST_KEY: usize = 64 << 10;
 
-/// Reads a trust file. What is wrong with a line is said with its number.
+/// Reads a trust file. An error in a line names the line's number.
 pub(super) fn trust(path: &Path) -> Result<TrustFile, CliError> {
     let mut bytes = Vec::new();
     let limit = TrustFile::MAX_LEN as u64 + 1;
@@ -31,7 +31,8 @@ pub(super) fn trust(path: &Path) -> Result<TrustFile, CliError> {
 
 /// Reads a private key.
 pub(super) fn key(path: &Path) -> Result<SigningKey, CliError> {
-    // Of full size from the start: a buffer that grows leaves what it held behind.
+    // The buffer has its full size from the start, because a buffer that grows leaves its former
+    // contents in memory.
     let mut bytes = Zeroizing::new(vec![0; LARGEST_KEY]);
     let len = File::open(path)
         .and_then(|file| fill(file, &mut bytes))
@@ -42,7 +43,7 @@ pub(super) fn key(path: &Path) -> Result<SigningKey, CliError> {
     })
 }
 
-/// Why a file could not be opened or read, for a user who is new to this tool.
+/// Describes why a file could not be opened or read, for a user who does not know this tool.
 pub(super) fn unread(path: &Path, error: &io::Error) -> CliError {
     match error.kind() {
         io::ErrorKind::NotFound => failed(path, &"there is no such file"),
@@ -52,7 +53,7 @@ pub(super) fn unread(path: &Path, error: &io::Error) -> CliError {
     }
 }
 
-/// A failure of the file at `path`.
+/// Returns a failure that concerns the file at `path`.
 pub(super) fn failed(path: &Path, reason: &dyn std::fmt::Display) -> CliError {
     CliError::failed(format!("{}: {reason}", path.display()))
 }

@@ -1,4 +1,4 @@
-//! `axon trust keygen`: a key for this host.
+//! `axon trust keygen`: creates a key for this host.
 
 use std::{
     fs::{self, File, OpenOptions},
@@ -17,14 +17,14 @@ pub(super) fn run(args: &cli::Keygen) -> Result<(), CliError> {
     let name = args.name.clone().unwrap_or_else(node_name);
     let pem = SigningKey::generate_pem_with(args.algorithm.into()).map_err(CliError::failed)?;
     let key = SigningKey::from_pem(&pem).map_err(CliError::failed)?;
-    // A name that no trust file can hold is refused before there is a file.
+    // A name that no trust file can hold is refused before the file is created.
     let line = line(&name, key.spki_digest())?;
     create(&args.file, pem.as_bytes())?;
     writeln!(std::io::stdout().lock(), "{line}")?;
     Ok(())
 }
 
-/// Writes a file that did not exist, for its owner alone.
+/// Writes a file that must not exist yet. Only its owner can read it.
 fn create(path: &Path, content: &[u8]) -> Result<(), CliError> {
     let mut options = OpenOptions::new();
     options.write(true).create_new(true).mode(0o600);
@@ -41,7 +41,7 @@ fn create(path: &Path, content: &[u8]) -> Result<(), CliError> {
         _ => failed(path, &error),
     })?;
     write(file, content).map_err(|error| {
-        // Half a key is of no use, and would be in the way of the next try.
+        // An incomplete key is of no use, and would make the next attempt fail.
         let _ = fs::remove_file(path);
         failed(path, &error)
     })

@@ -1,13 +1,13 @@
-//! A line of a trust file, as it is printed to be put into one.
+//! Formats a line to be added to a trust file.
 
 use axon_tls::identity::{SpkiDigest, TrustFile};
 
 use crate::{failure::CliError, text::printable};
 
-/// `NAME spki-sha256:BASE64`.
+/// Returns `NAME spki-sha256:BASE64`.
 ///
 /// # Errors
-/// A trust file would not give back this very name.
+/// A trust file that contains the line would not return this exact name.
 pub(super) fn line(name: &str, key: SpkiDigest) -> Result<String, CliError> {
     let line = format!("{name} {key}");
     let read = TrustFile::parse(&line);

@@ -1,4 +1,4 @@
-//! `axon trust list`: the keys in a trust file.
+//! `axon trust list`: lists the keys in a trust file.
 
 use std::{io::Write as _, path::PathBuf, time::SystemTime};
 
@@ -23,10 +23,11 @@ pub(super) fn run(args: &cli::List) -> Result<(), CliError> {
     Ok(())
 }
 
-/// The trust file, and our own key if there is one: as given, else as the settings say.
+/// Returns the paths of the trust file, and of this host's key if it has one. Arguments take
+/// precedence over settings.
 fn paths(args: &cli::List) -> Result<(PathBuf, Option<PathBuf>), CliError> {
     if let Some(file) = &args.file {
-        // A file is looked at before the settings are complete, too.
+        // A file can be listed before the settings are complete.
         let key = args.key.clone().or_else(|| match Config::from_env() {
             Ok(config) => classic(config).and_then(|classic| classic.key),
             Err(error) => {

@@ -1,4 +1,4 @@
-//! One look at the key of the daemon at an address.
+//! Reads the key of the daemon at an address.
 
 use std::{
     net::{Ipv4Addr, Ipv6Addr, SocketAddr},
@@ -14,7 +14,7 @@ use rustls::crypto::aws_lc_rs::cipher_suite::TLS13_AES_128_GCM_SHA256;
 
 use crate::text::printable;
 
-/// An endpoint from which `address` can be reached.
+/// Creates an endpoint from which `address` can be reached.
 pub(super) fn endpoint(address: SocketAddr) -> std::io::Result<Endpoint> {
     Endpoint::client(match address {
         SocketAddr::V4(_) => (Ipv4Addr::UNSPECIFIED, 0).into(),
@@ -22,10 +22,11 @@ pub(super) fn endpoint(address: SocketAddr) -> std::io::Result<Endpoint> {
     })
 }
 
-/// The key of the daemon at `address`: a raw public key or, where there is none, a certificate's.
+/// Returns the key of the daemon at `address`: a raw public key or, if the daemon has none, that of
+/// a certificate.
 ///
 /// # Errors
-/// There is none, or nothing; why, for people.
+/// The daemon has no key, or nothing answers. The text gives the reason.
 pub(super) async fn look(endpoint: &Endpoint, address: SocketAddr) -> Result<Shown, String> {
     let raw = Probe::for_raw_key(ALPN).map_err(|e| e.to_string())?;
     match connect(endpoint, address, &raw).await? {
@@ -41,13 +42,13 @@ const HANDSHAKE_FAILURE: u8 = 40;
 const MISSING_EXTENSION: u8 = 109;
 const NO_APPLICATION_PROTOCOL: u8 = 120;
 
-/// One handshake, which fails however it ends.
+/// Makes one handshake. It fails in any case.
 async fn connect(
     endpoint: &Endpoint,
     address: SocketAddr,
     probe: &Probe,
 ) -> Result<Result<Shown, ConnectionError>, String> {
-    // For the Initial packets, which QUIC version 1 wants so; TLS does not offer it.
+    // QUIC version 1 requires this cipher for Initial packets. TLS does not offer it.
     let initial = TLS13_AES_128_GCM_SHA256.tls13().and_then(|suite| suite.quic_suite());
     let initial = initial.ok_or("rustls lacks the cipher of QUIC's Initial packets")?;
     let tls = QuicClientConfig::with_initial(probe.client_config(), initial);
@@ -92,7 +93,7 @@ mod tests {
 
     use super::*;
 
-    /// What is seen of a server, and that the server never had a connection.
+    /// Returns what a probe sees of a server, and checks that the server never had a connection.
     async fn seen_of(config: quinn::ServerConfig) -> Result<Shown, String> {
         let server = Endpoint::server(config, (Ipv4Addr::LOCALHOST, 0).into()).expect("endpoint");
         let address = server.local_addr().expect("address");

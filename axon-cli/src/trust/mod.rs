@@ -1,4 +1,4 @@
-//! `axon trust`: this host's key, and the keys of the hosts that it links with.
+//! `axon trust`: manages this host's key and the keys of the hosts that it connects to.
 
 pub(crate) mod cli;
 mod files;

@@ -1,4 +1,5 @@
-//! `axon trust scan`: the keys that a host's daemons show, for a person to confirm.
+//! `axon trust scan`: prints the keys that a host's daemons show, so that a person can confirm
+//! them.
 
 use std::{
     collections::{BTreeMap, BTreeSet},
@@ -24,7 +25,7 @@ use super::{
 };
 use crate::{failure::CliError, say::say, text::printable};
 
-/// When one port has answered, the others have this long.
+/// The time that the other ports have after one port has answered.
 const OTHERS: Duration = Duration::from_secs(1);
 
 const NOTHING_VERIFIED: &str = "\
@@ -35,7 +36,7 @@ const NOTHING_VERIFIED: &str = "\
 /// Runs `axon trust scan`.
 pub(super) fn run(args: &cli::Scan) -> Result<(), CliError> {
     let name = args.name.as_deref().unwrap_or(&args.target.host);
-    // Before anybody is asked.
+    // The name is checked before any host is contacted.
     line(name, SpkiDigest([0; 32]))?;
     let domain = domain()?;
     let limit = Duration::from_secs(args.timeout);
@@ -62,7 +63,8 @@ pub(super) fn run(args: &cli::Scan) -> Result<(), CliError> {
     for (key, names) in &found.keys {
         let _ = match names {
             None => writeln!(out, "{}", line(name, *key)?),
-            // No line of a trust file: such a host is known by its roots.
+            // This is not a line of a trust file, because such a host is known by its root
+            // certificates.
             Some(names) => writeln!(
                 out,
                 "# {name} shows a certificate (AXON_CLASSIC_AUTH=ca) for {}: {key}",
@@ -75,16 +77,17 @@ pub(super) fn run(args: &cli::Scan) -> Result<(), CliError> {
     Ok(())
 }
 
-/// This host's own keys need not be set up to look at others, so no other setting is read.
+/// Returns the domain. A scan must work before this host's own keys are set up, so no other setting
+/// is read.
 fn domain() -> Result<u32, CliError> {
     let env = std::env::vars_os().filter(|(name, _)| name == "ROS_DOMAIN_ID");
     Ok(Config::resolve(env, None, &OsFiles)?.domain)
 }
 
-/// What was seen at an address, or why nothing was.
+/// An address, and the key found there or the reason why none was found.
 type Seen = (SocketAddr, Result<Shown, String>);
 
-/// Looks at every address at once; those that answer in time.
+/// Probes all addresses at the same time, and returns the results that came in time.
 async fn scan(addresses: &[SocketAddr], limit: Duration) -> Vec<Seen> {
     let mut endpoints: BTreeMap<bool, Endpoint> = BTreeMap::new();
     let mut looks = JoinSet::new();
@@ -114,7 +117,8 @@ async fn scan(addresses: &[SocketAddr], limit: Duration) -> Vec<Seen> {
         seen.push(one);
     }
     drop(looks);
-    // The daemons are told that it is over, and do not wait for the rest of a handshake.
+    // This tells the daemons that the probes have ended, so that they do not wait for the rest of a
+    // handshake.
     for endpoint in endpoints.into_values() {
         let _ = timeout(OTHERS, endpoint.wait_idle()).await;
     }
@@ -122,11 +126,11 @@ async fn scan(addresses: &[SocketAddr], limit: Duration) -> Vec<Seen> {
     seen
 }
 
-/// What to say of a scan.
+/// The results of a scan.
 struct Found {
-    /// Each key once, with the names in its certificate if it has one.
+    /// Each key once, with the names in its certificate if it came in one.
     keys: BTreeSet<(SpkiDigest, Option<Vec<String>>)>,
-    /// A comment line for each address that answered.
+    /// One comment line for each address with a result.
     notes: String,
 }
 

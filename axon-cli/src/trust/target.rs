@@ -1,8 +1,8 @@
-//! Whom to scan: what was typed, and the addresses that it means.
+//! The target of a scan: the argument, and its addresses.
 
 use std::{io, net::SocketAddr, str::FromStr};
 
-/// A host that resolves to more addresses is scanned at the first of them.
+/// The most addresses of one host that are scanned. They are the first to which its name resolves.
 const MAX_ADDRESSES: usize = 4;
 
 /// `HOST`, `HOST:PORT`, `[IPv6]` or `[IPv6]:PORT`.
@@ -13,7 +13,7 @@ pub(crate) struct HostTarget {
 }
 
 impl HostTarget {
-    /// The addresses at each of `ports`, or at the port that was typed.
+    /// Returns the addresses at each of `ports`, or at the port in the argument.
     pub(super) async fn addresses(
         &self,
         ports: impl Iterator<Item = u16> + Clone,
@@ -46,7 +46,7 @@ impl FromStr for HostTarget {
                     None => return Err("after ] comes :PORT or nothing"),
                 }
             }
-            // More than one colon: an IPv6 address by itself.
+            // More than one colon means an IPv6 address without a port.
             None if text.matches(':').count() == 1 => {
                 let (host, port) = text.split_once(':').unwrap_or((text, ""));
                 (host, Some(port))

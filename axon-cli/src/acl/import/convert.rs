@@ -1,4 +1,4 @@
-//! What a grant says of topics of DDS, as rules for topics, services and actions.
+//! Converts the expressions of a grant, which are about DDS topics, into rules for topics, services and actions.
 
 use std::collections::BTreeMap;
 
@@ -14,7 +14,7 @@ use super::{
 };
 use crate::acl::write::{Names, Uses};
 
-/// The topic on which ROS 2 tells which nodes there are.
+/// The DDS topic on which ROS 2 announces nodes and their endpoints.
 const GRAPH: &str = "ros_discovery_info";
 
 /// The rules of a grant.
@@ -25,11 +25,11 @@ pub(super) struct Rules {
     pub(super) deny: Uses,
 }
 
-/// Patterns of one part and direction, and the line of each.
+/// The patterns of one topic part and direction, and the line of each.
 #[derive(Debug, Default)]
 struct Patterns {
     lines: BTreeMap<String, u32>,
-    /// Those with a star.
+    /// The patterns that contain a star.
     starred: Vec<TopicPattern>,
 }
 
@@ -41,14 +41,14 @@ impl Patterns {
         self.lines.entry(pattern).or_insert(line);
     }
 
-    /// Whether each name that a pattern fits is in these, as far as that can be told.
+    /// Returns whether these patterns fit each name that `pattern` fits. It may return `false` although they do.
     fn cover(&self, pattern: &str) -> bool {
         self.lines.contains_key(pattern)
             || ["/**", "**"].iter().any(|all| self.lines.contains_key(*all))
             || !pattern.contains('*') && self.starred.iter().any(|starred| starred.fits(pattern))
     }
 
-    /// Whether some name may be in these and fit a pattern.
+    /// Returns whether a name may exist that both `pattern` and one of these patterns fit.
     fn overlap(&self, pattern: &str) -> bool {
         if !pattern.contains('*') {
             return self.cover(pattern);
@@ -70,10 +70,10 @@ impl Patterns {
     }
 }
 
-/// All patterns of allowing, or of denying.
+/// All patterns that allow, or all that deny.
 type Sets = BTreeMap<(TopicUse, TopicPart), Patterns>;
 
-/// The rules that say the same. What they cannot say is in `notes`.
+/// Returns the rules that are equivalent to a grant. `notes` receives the differences that rules cannot express.
 pub(super) fn convert(grant: &Grant, notes: &mut Notes) -> Rules {
     let (mut allowed, mut denied) = (Sets::new(), Sets::new());
     let mut see = Names::new();
@@ -106,7 +106,7 @@ pub(super) fn convert(grant: &Grant, notes: &mut Notes) -> Rules {
                             decides, here the denial does";
                 notes.add(Effect::Less, says.line, what);
             }
-            // `*` fits names without a slash before them, too.
+            // The expression `*` also fits names without a leading slash.
             let all = pattern == "/**" && says.expression.bytes().all(|byte| byte == b'*');
             let pattern = if all { "**".to_owned() } else { pattern };
             denied.entry(key).or_default().insert(pattern, says.line);
@@ -128,7 +128,7 @@ pub(super) fn convert(grant: &Grant, notes: &mut Notes) -> Rules {
     Rules { allow, deny }
 }
 
-/// A rule for the graph, which AXON has no topic for.
+/// Converts an expression for the graph, for which AXON has no topic.
 fn graph(says: &Says, see: &mut Names, notes: &mut Notes) {
     match (says.allows, says.does) {
         (true, TopicUse::Subscribe) => {
@@ -165,7 +165,7 @@ fn uses(sets: &mut Sets, allows: bool, notes: &mut Notes) -> Uses {
     }
 }
 
-/// The services of which requests and responses are both there. Of what is denied either half is enough.
+/// Returns the services whose requests and responses are both named. For a denial one of the two is enough.
 fn pair(
     what: &str,
     requests: &Patterns,

@@ -1,20 +1,20 @@
-//! What a document says, in the order in which it says it.
+//! The contents of a document, in the document's order.
 
 use axon_transport::internal::sros2::{document::MOST_EXPRESSIONS, names::TopicUse};
 
 use super::notes::{Effect, Notes};
 
-/// One expression.
+/// One expression of a document.
 #[derive(Debug)]
 pub(super) struct Says {
     pub(super) allows: bool,
     pub(super) does: TopicUse,
-    /// For topics of DDS.
+    /// The expression, which fits names of DDS topics.
     pub(super) expression: String,
     pub(super) line: u32,
 }
 
-/// What one enclave may do.
+/// The permissions of one enclave.
 #[derive(Debug)]
 pub(super) struct Grant {
     pub(super) enclave: String,
@@ -24,7 +24,7 @@ pub(super) struct Grant {
 
 impl Grant {
     /// # Errors
-    /// There is too much.
+    /// The grant already has `MOST_EXPRESSIONS` expressions.
     pub(super) fn push(&mut self, says: Says) -> Result<(), String> {
         if self.says.len() == MOST_EXPRESSIONS {
             return Err(format!("more than {MOST_EXPRESSIONS} expressions for {:?}", self.enclave));
@@ -34,10 +34,10 @@ impl Grant {
     }
 }
 
-/// The one part of a document that is about an enclave. `all` has the parts, each with the names that it goes by.
+/// Returns the one part of a document that belongs to an enclave. `all` holds the parts, each with its names.
 ///
 /// # Errors
-/// There is none, or more than one.
+/// No part, or more than one, belongs to the enclave.
 pub(super) fn choose<T>(
     all: Vec<(T, Vec<String>)>,
     what: &str,
@@ -61,7 +61,7 @@ pub(super) fn choose<T>(
     }
 }
 
-/// Notes an element that nobody knows here.
+/// Adds a note about an element that this importer does not know.
 pub(super) fn unknown(name: &str, line: u32, effect: Effect, notes: &mut Notes) {
     notes.add(effect, line, format!("element <{name}> is not known, and was not looked at"));
 }

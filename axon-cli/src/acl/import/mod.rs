@@ -1,4 +1,4 @@
-//! `axon acl import`: rules from SROS2's documents.
+//! `axon acl import`: writes rules from SROS2's documents.
 
 mod convert;
 mod document;
@@ -43,7 +43,7 @@ pub(super) fn run(args: &cli::Import) -> Result<ExitCode, CliError> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// The text of a file that is not too large.
+/// Returns the text of a file. A file that is too large is refused.
 fn read(path: &Path) -> Result<String, String> {
     let mut bytes = Vec::new();
     let mut file = File::open(path).map_err(|error| error.to_string())?.take(xml::LARGEST + 1);
@@ -54,7 +54,7 @@ fn read(path: &Path) -> Result<String, String> {
     String::from_utf8(bytes).map_err(|_| "not UTF-8".to_owned())
 }
 
-/// The rules of a document for a peer, as a file that can be used.
+/// Returns the rules that a document gives a peer, as the text of a rules file.
 fn import(
     text: &str,
     peer: &str,

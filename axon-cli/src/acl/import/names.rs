@@ -1,14 +1,14 @@
-//! Topics of DDS as ROS 2 and SROS2 write them, and the patterns of AXON that fit the same names.
+//! DDS topic names as ROS 2 and SROS2 write them, and the patterns of AXON that fit the same names.
 
 use axon_transport::{access::TopicPattern, internal::sros2::names::TopicPart};
 
-/// As many patterns as one expression may become.
+/// The most patterns that one expression may become.
 const MAX_PATTERNS: usize = 16;
 
-/// What an expression of DDS stands for, and the patterns that fit the same names of ROS.
+/// Returns the topic parts that a DDS expression stands for, each with the patterns that fit the same ROS names.
 ///
 /// # Errors
-/// No pattern says the same; the error says why.
+/// No pattern is equivalent; the error says why.
 pub(super) fn parts(expression: &str) -> Result<Vec<(TopicPart, Vec<String>)>, &'static str> {
     if !expression.is_empty() && expression.bytes().all(|byte| byte == b'*') {
         return Ok(TopicPart::ALL.map(|part| (part, vec!["/**".to_owned()])).into());
@@ -21,18 +21,20 @@ pub(super) fn parts(expression: &str) -> Result<Vec<(TopicPart, Vec<String>)>, &
         return Err("not a topic of ROS 2: AXON carries those that begin with rt/, rq/ or rr/");
     };
     let suffix = part.mangling().1;
-    // With its slash.
+    // The name, with its leading slash.
     let name = &expression[2..];
     let name = match (name.strip_suffix(suffix), name.strip_suffix('*')) {
         (Some(name), _) => name,
-        // The star takes the suffix. Where a part of the suffix stands before it, no pattern says the same.
+        // The star also stands for the suffix. If the text before the star ends with the beginning of the suffix, no
+        // pattern is equivalent.
         (None, Some(before)) if !(1..=suffix.len()).any(|n| before.ends_with(&suffix[..n])) => name,
         _ => return Err("not a service's: its topics end in Request and Reply"),
     };
     Ok(vec![(part, patterns(name)?)])
 }
 
-/// The patterns that fit together what an expression fits, in which `*` stands for any characters, slashes as well.
+/// Returns the patterns that together fit what an expression fits. A `*` of an expression stands for any characters,
+/// including slashes.
 fn patterns(name: &str) -> Result<Vec<String>, &'static str> {
     if name.contains(['?', '[', '\\']) {
         return Err("AXON's patterns have * and ** alone, not ?, [ ] and \\");
@@ -48,7 +50,7 @@ fn patterns(name: &str) -> Result<Vec<String>, &'static str> {
         all = all.iter().flat_map(longer).collect();
     }
     for pattern in &mut all {
-        // A name has a segment.
+        // `/**` is equivalent here, because a name has at least one segment.
         if pattern == "/*/**" {
             "/**".clone_into(pattern);
         }
@@ -57,7 +59,7 @@ fn patterns(name: &str) -> Result<Vec<String>, &'static str> {
     Ok(all)
 }
 
-/// The ways to write one segment of an expression, whose `*` may stand for slashes. Names have no empty segment.
+/// Returns the ways to write one segment of an expression. Its `*` may stand for slashes. A name has no empty segment.
 fn ways(segment: &str) -> Vec<String> {
     let inner = segment.trim_matches('*');
     if inner.is_empty() && !segment.is_empty() {
@@ -128,7 +130,7 @@ mod tests {
         }
     }
 
-    /// fnmatch without flags.
+    /// Matches as fnmatch does without flags.
     fn fits(pattern: &[u8], name: &[u8]) -> bool {
         match (pattern.first(), name.first()) {
             (None, None) => true,
@@ -139,7 +141,7 @@ mod tests {
         }
     }
 
-    /// All texts of these characters, each behind a slash.
+    /// Returns all names of up to `longest` of these characters after the leading slash, without empty segments.
     fn texts(characters: &[char], longest: usize) -> Vec<String> {
         let mut all = vec!["/".to_owned()];
         let mut last = all.clone();

@@ -1,31 +1,31 @@
-//! What rules cannot say of a document.
+//! Differences between a document and the rules that are made from it.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::text::printable;
 
-/// What the difference means.
+/// The effect of a difference.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Effect {
     /// The rules allow more than the document.
     More,
-    /// They allow less.
+    /// The rules allow less than the document.
     Less,
-    /// Neither.
+    /// The rules allow as much as the document.
     None,
 }
 
-/// Differences, each with the lines of the document that it is about.
+/// Differences, each with the lines of the document that it concerns.
 #[derive(Debug, Default)]
 pub(super) struct Notes(BTreeMap<(Effect, String), BTreeSet<u32>>);
 
 impl Notes {
-    /// Line 0 stands for the whole document.
+    /// Adds a difference. Line 0 stands for the whole document.
     pub(super) fn add(&mut self, effect: Effect, line: u32, what: impl Into<String>) {
         self.0.entry((effect, what.into())).or_default().insert(line);
     }
 
-    /// A line each. No name in it can end the line.
+    /// Returns one line for each difference. Names are escaped, so no name can end the line.
     pub(super) fn lines(&self) -> impl Iterator<Item = String> {
         self.0.iter().map(|((effect, what), lines)| {
             let effect = match effect {

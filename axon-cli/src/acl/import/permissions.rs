@@ -1,4 +1,4 @@
-//! Permissions of DDS Security, as `permissions.xml` of an enclave has them, and what of them no rule can say.
+//! Reads permissions of DDS Security from an enclave's `permissions.xml`, and notes what no rule can express.
 
 use axon_transport::internal::sros2::document::{self, Domains, SubjectRule, UnknownElement};
 
@@ -7,10 +7,10 @@ use super::{
     notes::{Effect, Notes},
 };
 
-/// The grant for an enclave.
+/// Returns the grant for an enclave.
 ///
 /// # Errors
-/// There is none, or more than one.
+/// No grant, or more than one, is for the enclave; or the grant has too many expressions.
 pub(super) fn choose_and_note(
     grants: Vec<document::SubjectGrant>,
     enclave: Option<&str>,
@@ -46,7 +46,7 @@ pub(super) fn choose_and_note(
     Ok(read)
 }
 
-/// What a grant can be called: its name, its subject, and the common name in it.
+/// Returns the names of a grant: its own name, the common name in its subject, and the subject.
 fn names(grant: &document::SubjectGrant) -> Vec<String> {
     let subject = grant.subject.clone().map(|(subject, _)| subject).unwrap_or_default();
     let common = document::common_name(&subject).map(str::to_owned);
@@ -55,7 +55,8 @@ fn names(grant: &document::SubjectGrant) -> Vec<String> {
 
 fn rule(rule: SubjectRule, read: &mut Grant, notes: &mut Notes) -> Result<(), String> {
     let allows = rule.allows;
-    // What is left out of an allow_rule allows less, and of a deny_rule more. What is taken in whole does the reverse.
+    // Rules that omit a part of an allow_rule allow less, and rules that omit a part of a deny_rule allow more. Rules
+    // that take a restricted part without its restriction do the reverse.
     let (left_out, in_whole) =
         if allows { (Effect::Less, Effect::More) } else { (Effect::More, Effect::Less) };
     for of in &rule.domains {

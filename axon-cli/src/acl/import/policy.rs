@@ -1,4 +1,5 @@
-//! SROS2's policy, from which it makes the permissions of enclaves. Its denials come first there: they win, as here.
+//! SROS2's policy, from which SROS2 makes the permissions of enclaves. SROS2 writes denials first, so that they win, as
+//! they do here.
 
 use axon_transport::internal::{
     access::{ACTION_SERVICES, ACTION_TOPICS},
@@ -18,7 +19,7 @@ use super::{
 /// Reads the profiles of an enclave from the element `policy`.
 ///
 /// # Errors
-/// There is no such enclave, or other files are needed.
+/// The policy has no such enclave, includes other files, or is not valid.
 pub(super) fn read(
     root: Node<'_, '_>,
     enclave: Option<&str>,
@@ -48,7 +49,7 @@ pub(super) fn read(
             }
         }
     }
-    // SROS2 writes all denials before all else, and the first rule that fits decides.
+    // SROS2 writes all denials before all other rules, and the first rule that fits decides.
     read.says.sort_by_key(|says| says.allows);
     Ok(read)
 }
@@ -77,7 +78,7 @@ fn profile(
                 ("actions", "execute") => {
                     |name| action(TopicUse::Subscribe, TopicUse::Publish, name)
                 }
-                // It says where an included file was.
+                // This attribute tells where an included file was.
                 (_, "base") => continue,
                 (_, other) => return Err(format!("line {line}: {kind} has no {other}")),
             };
@@ -98,7 +99,7 @@ fn profile(
     Ok(())
 }
 
-/// The full name of a topic, service or action that a node calls so.
+/// Returns the full name of a topic, service or action that a node calls `name`.
 fn full(name: &str, namespace: &str, node: &str) -> String {
     let namespace = namespace.strip_suffix('/').unwrap_or(namespace);
     match name.strip_prefix('~') {
@@ -116,7 +117,7 @@ fn topic(does: TopicUse, name: &str) -> (TopicUse, String) {
     (does, TopicPart::Topic.dds_name(name))
 }
 
-/// A client publishes requests, and a server subscribes to them.
+/// Returns the topics of a service. A client publishes requests, and a server subscribes to them.
 fn service(requests: TopicUse, name: &str) -> [(TopicUse, String); 2] {
     let replies =
         if requests == TopicUse::Publish { TopicUse::Subscribe } else { TopicUse::Publish };

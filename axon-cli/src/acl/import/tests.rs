@@ -1,10 +1,10 @@
-//! Documents of SROS2, and documents that want to do harm.
+//! Tests with documents of SROS2, and with hostile documents.
 
 use axon_transport::access::{AccessRules, Principal, Verb};
 
 use super::{Notes, import};
 
-/// A grant of these rules.
+/// Returns permissions with these rules.
 fn permissions(rules: &str, default: &str) -> String {
     format!(
         "<dds><permissions>\n<grant name=\"/arm\">\n<subject_name>CN=/arm</subject_name>\n{rules}\n\
@@ -25,7 +25,7 @@ fn rule(kind: &str, publish: &[&str], subscribe: &[&str]) -> String {
     )
 }
 
-/// The text, and the notes.
+/// Returns the text of the rules and the notes.
 fn imported(document: &str) -> (String, String) {
     let mut notes = Notes::default();
     let text = import(document, "base", None, &mut notes).unwrap();
@@ -55,7 +55,7 @@ fn request_and_response_topics_together_become_a_service_rule() {
     assert!(!may(&text, Verb::Call, "/also"));
     assert!(notes.contains("left out \"rq/half/Request\""), "{notes}");
     assert!(notes.contains("\"/also\": of a call it names the responses alone"), "{notes}");
-    // Either half of a denial denies the whole.
+    // A denial of requests or of responses denies the whole service.
     let deny = rule("deny", &["rq/addRequest"], &[]) + &rule("allow", &["*"], &["*"]);
     let (text, notes) = imported(&permissions(&deny, "DENY"));
     assert!(!may(&text, Verb::Call, "/add") && may(&text, Verb::Call, "/other"), "{text}");
@@ -87,7 +87,7 @@ fn a_whole_action_and_a_whole_set_of_parameters_are_one_name_each() {
     let (text, _) = imported(&permissions(&rule("allow", &publish, &subscribe), "DENY"));
     let rules = text.split_once("[[allow]]").unwrap().1;
     assert_eq!(rules, "\npeer = \"base\"\nact = \"/dock\"\nparameters = \"/arm\"\n");
-    // The server's side.
+    // The permissions of the server.
     let subscribe = of("rq/", "Request", &services);
     let mut publish = of("rr/", "Reply", &services);
     publish.extend(of("rt/dock/_action/", "", &["feedback", "status"]));
@@ -106,7 +106,7 @@ fn a_denial_wins_and_where_dds_decides_otherwise_that_is_said() {
         assert!(!may(&text, Verb::Publish, "/arm/stop") && may(&text, Verb::Publish, "/arm/go"));
         assert_eq!(notes.contains("in DDS the first rule that fits"), differs, "{notes}");
     }
-    // The one says nothing of the other.
+    // The denial and the permission have no name in common.
     let other = rule("deny", &["rt/leg/*"], &["rt/arm/stop"]);
     let (_, notes) = imported(&permissions(&format!("{allow}{other}"), "DENY"));
     assert!(!notes.contains("in DDS the first"), "{notes}");
@@ -150,7 +150,7 @@ fn each_thing_that_cannot_be_honoured_is_named_with_its_line() {
         assert!(text.contains(&format!("# {}", notes.lines().next().unwrap())), "{text}");
     }
     assert!(may(&text, Verb::Publish, "/whole") && !may(&text, Verb::Publish, "/parted"));
-    // A denial for a partition is a denial of all.
+    // A denial for a partition denies the topic in all partitions.
     let parted = "<deny_rule><publish><topics><topic>rt/parted</topic></topics>\
          <partitions><partition>left</partition></partitions></publish></deny_rule>";
     let (text, _) = imported(&permissions(parted, "ALLOW"));
@@ -164,10 +164,10 @@ fn a_denial_of_all_names_those_without_a_slash_too() {
     for verb in [Verb::Publish, Verb::Subscribe, Verb::Call, Verb::Serve] {
         assert!(!may(&text, verb, "/a") && !may(&text, verb, "no_slash"), "{verb} {text}");
     }
-    // The topics of ROS 2 alone, which all have one.
+    // The pattern denies topics of ROS 2 only, whose names all have a leading slash.
     let (text, _) = imported(&permissions(&rule("deny", &["rt/*"], &[]), "ALLOW"));
     assert!(!may(&text, Verb::Publish, "/a") && may(&text, Verb::Publish, "no_slash"), "{text}");
-    // Neither half of what is denied needs the other.
+    // A denial of requests needs no denial of responses, and the reverse.
     let deny = rule("deny", &["*", "rq/addRequest"], &["rr/addReply", "*"]);
     let (text, notes) = imported(&permissions(&deny, "ALLOW"));
     assert!(!may(&text, Verb::Call, "/add") && !notes.contains("names the"), "{notes}");

@@ -1,4 +1,4 @@
-//! `axon acl learn`: watches what other hosts and users do here, and writes the rules that let them go on.
+//! `axon acl learn`: watches what other hosts and users do here, and writes the rules that allow it.
 
 mod seen;
 
@@ -24,13 +24,13 @@ use self::seen::{Observed, Owner, Seen};
 use super::cli;
 use crate::{failure::CliError, interrupt, logging, say::say, session};
 
-/// Between two looks while nothing changes.
+/// The longest time between two checks while nothing changes.
 const CHECK_INTERVAL: Duration = Duration::from_millis(100);
-/// How long changes of the graph are collected.
+/// The time during which changes of the graph are collected.
 const MOMENT: Duration = Duration::from_millis(10);
-/// Between two looks at the daemon's status, if there is no new host or session.
+/// The time between two requests for the daemon's status while every host and session is known.
 const STATUS: Duration = Duration::from_secs(2);
-/// Between two lines of progress on a terminal.
+/// The time between two lines of progress on a terminal.
 const PROGRESS: Duration = Duration::from_secs(1);
 
 /// Runs `axon acl learn`.
@@ -42,7 +42,7 @@ pub(super) fn run(args: &cli::Learn) -> Result<ExitCode, CliError> {
         return Err(exists(file));
     }
     let mut config = logging::configure()?;
-    // What it would start has nothing to show.
+    // A daemon that this session started would know no other host or user.
     config.daemon = DaemonPolicy::Require;
     let session =
         Session::open(&config, SessionOptions::new("axon acl learn")).map_err(session::failure)?;
@@ -88,7 +88,7 @@ pub(super) fn run(args: &cli::Learn) -> Result<ExitCode, CliError> {
     match &args.output {
         Some(file) => write(file, &rules, args.force)?,
         None => match io::stdout().lock().write_all(rules.as_bytes()) {
-            // The reader of the pipe closed it: it wants no more lines.
+            // The reader of the pipe closed it, so it wants no more lines.
             Err(error) if error.kind() == io::ErrorKind::BrokenPipe => {}
             written => written?,
         },
@@ -100,7 +100,7 @@ fn exists(file: &Path) -> CliError {
     CliError::failed(format!("{}: it exists; --force replaces it", file.display()))
 }
 
-/// Writes a file at once: a daemon that reads it finds the rules of before, or these.
+/// Writes a file atomically: a daemon that reads it finds the former rules or these.
 fn write(file: &Path, rules: &str, force: bool) -> Result<(), CliError> {
     let failed = |error: io::Error| CliError::failed(format!("{}: {error}", file.display()));
     let mut name = file.as_os_str().to_owned();
@@ -109,7 +109,7 @@ fn write(file: &Path, rules: &str, force: bool) -> Result<(), CliError> {
     let mut new =
         fs::OpenOptions::new().write(true).create_new(true).open(&part).map_err(failed)?;
     let placed = new.write_all(rules.as_bytes()).and_then(|()| {
-        // A link takes no name that somebody has taken meanwhile.
+        // `hard_link` does not replace a file that was created in the meantime.
         if force { fs::rename(&part, file) } else { fs::hard_link(&part, file) }
     });
     let _ = fs::remove_file(&part);
@@ -124,44 +124,45 @@ struct Watch {
     interrupt: GuardCondition,
     known: Known,
     seen: Seen,
-    /// The daemon tells this user nothing.
+    /// The daemon reports nothing to this user.
     withheld: bool,
 }
 
-/// What the daemon says of whose endpoints are.
+/// The owners of endpoints, as far as the daemon has reported them.
 #[derive(Default)]
 struct Known {
-    /// The names of other hosts, by their daemons. They stay known when a link ends.
+    /// The name of each other host, by its daemon. A name is kept after the link ends.
     hosts: HashMap<DaemonId, Option<String>>,
-    /// The owners of the sessions of this host, by the first characters of their GIDs. `None`: the daemon did not say yet.
+    /// The owner of each session of this host, by the first characters of the session's GIDs. `None` until the daemon
+    /// reports it.
     sessions: HashMap<String, Option<LocalOwner>>,
     asked: Option<Instant>,
-    /// Hosts that had endpoints and whose names were never known.
+    /// The number of hosts that had endpoints and whose names never became known.
     unnamed: usize,
-    /// Sessions of this host that had endpoints, and of which it was never known whose they are.
+    /// The number of sessions of this host that had endpoints and whose owners never became known.
     unowned: usize,
 }
 
 /// The owner of a session of this host.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum LocalOwner {
-    /// The daemon's user's.
+    /// The daemon's own user.
     Own,
-    /// Of the user with this id.
+    /// The user with this id.
     User(u32),
 }
 
-/// Characters of a GID in hexadecimal that all endpoints of a session share.
+/// The number of hexadecimal characters of a GID that all endpoints of a session share.
 const OF_SESSION: usize = 24;
 
-/// The first characters of all GIDs of an endpoint's session.
+/// Returns the characters that all GIDs of an endpoint's session begin with.
 fn session_of(gid: Gid) -> String {
     let mut text = gid.to_string();
     text.truncate(OF_SESSION);
     text
 }
 
-/// The daemon of each endpoint, if it is another host's, and its GID.
+/// Returns the GID of each endpoint, and the daemon if the endpoint is of another host.
 fn places(graph: &GraphView) -> impl Iterator<Item = (Option<DaemonId>, Gid)> {
     graph.endpoints.iter().map(|(gid, entry)| (entry.daemon, *gid))
 }
@@ -185,7 +186,7 @@ impl Watch {
             self.known.meet(places(&graph));
             let is_new = version != Some(graph.version);
             let has_strangers = self.known.has_strangers(places(&graph));
-            // After a host's name is known its endpoints are looked at again.
+            // When the name of a host becomes known, its endpoints are evaluated again.
             if is_new || has_strangers || self.known.asked.is_none() {
                 version = (!has_strangers).then_some(graph.version);
                 self.look(&graph);
@@ -202,7 +203,7 @@ impl Watch {
                     "\r{seconds} s: {uses} uses of {parties} hosts and users\x1b[K\r"
                 );
             }
-            // Changes of a moment are looked at together.
+            // Changes within a short time are evaluated together.
             std::thread::sleep(MOMENT.min(left));
             self.session
                 .wait_graph(CHECK_INTERVAL.min(left), |graph| version != Some(graph.version));
@@ -215,8 +216,8 @@ impl Watch {
         self.known.unowned = self.known.sessions.values().filter(|owner| owner.is_none()).count();
     }
 
-    /// Asks the daemon for its status, if it is time, or if there is a host or session of which nothing is known. Returns
-    /// whether a host or session became known: its endpoints are to be looked at again.
+    /// Asks the daemon for its status, if the time has come. The time is shorter while a host or session is unknown.
+    /// Returns whether a host or session became known; its endpoints then have to be evaluated again.
     fn ask(&mut self) -> bool {
         let graph = self.session.graph();
         let has_strangers = self.known.has_strangers(places(&graph));
@@ -224,7 +225,7 @@ impl Watch {
         if self.known.asked.is_some_and(|asked| asked.elapsed() < time) {
             return false;
         }
-        // Without a daemon there is nothing to ask.
+        // Without a daemon there is no status.
         let Ok(json) = self.session.status_json() else { return false };
         let Ok(status) = serde_json::from_str::<Status>(&json) else { return false };
         self.known.asked = Some(Instant::now());
@@ -267,7 +268,7 @@ impl Watch {
 }
 
 impl Known {
-    /// Whether there are endpoints of a host without a name, or of a session of which nothing is known.
+    /// Returns whether an endpoint belongs to a host without a name or to a session without a known owner.
     fn has_strangers(&self, endpoints: impl IntoIterator<Item = (Option<DaemonId>, Gid)>) -> bool {
         endpoints.into_iter().any(|(daemon, gid)| match daemon {
             Some(daemon) => self.hosts.get(&daemon).is_none_or(Option::is_none),
@@ -275,7 +276,7 @@ impl Known {
         })
     }
 
-    /// There are endpoints of these sessions of this host.
+    /// Records the sessions of this host that have these endpoints.
     fn meet(&mut self, endpoints: impl IntoIterator<Item = (Option<DaemonId>, Gid)>) {
         let local = endpoints.into_iter().filter(|(daemon, _)| daemon.is_none());
         for (_, gid) in local {
@@ -283,7 +284,7 @@ impl Known {
         }
     }
 
-    /// Hosts and sessions that are known.
+    /// Returns the numbers of known hosts and of known sessions.
     fn counts(&self) -> (usize, usize) {
         (self.hosts.values().flatten().count(), self.sessions.values().flatten().count())
     }
@@ -321,7 +322,7 @@ mod tests {
 
     use super::*;
 
-    /// An endpoint of each of these sessions of this host.
+    /// Returns one endpoint for each of these sessions of this host.
     fn of(sessions: &[u8]) -> Vec<(Option<DaemonId>, Gid)> {
         sessions.iter().map(|session| (None, Gid([*session; 16]))).collect()
     }

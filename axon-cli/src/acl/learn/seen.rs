@@ -1,4 +1,4 @@
-//! What other hosts and users did with topics and services of this host, and the rules that let them go on.
+//! Records what other hosts and users did with topics and services of this host, and writes the rules that allow it.
 
 use std::{
     collections::{BTreeMap, BTreeSet, HashMap},
@@ -15,37 +15,37 @@ use crate::{
     text::printable,
 };
 
-/// Lines of each kind that a comment has at most.
+/// The most lines of each kind in a comment.
 const LISTED: usize = 100;
 
-/// `[[expect]]` that a file of rules may have.
+/// The most `[[expect]]` in a rules file.
 const MOST_EXPECTATIONS: usize = 4096;
 
-/// What somebody does with a topic or service.
+/// The use of a topic or service by a host or user.
 pub(super) type Use = (Verb, String);
 
-/// Whose an endpoint is.
+/// The owner of an endpoint.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Owner<'a> {
-    /// The daemon's user: rules do not speak of it.
+    /// The daemon's user, whom no rule concerns.
     Own,
     /// Another user of this host.
     User(u32),
-    /// Another host, as rules know it.
+    /// Another host, by the name that rules have for it.
     Host(&'a str),
 }
 
-/// An endpoint at one moment.
+/// An endpoint at the time of an observation.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Observed<'a> {
     pub(super) owner: Owner<'a>,
-    /// What is the same for all endpoints of a session.
+    /// The bytes that the GIDs of all endpoints of a session share.
     pub(super) session: [u8; 12],
     pub(super) verb: Verb,
     pub(super) name: &'a str,
 }
 
-/// The name that rules have for a host or a user. A host may have a name that stands for something else in rules.
+/// The name of a host or user. The name of a host may mean something else in a rule.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Name {
     Host(String),
@@ -53,7 +53,7 @@ enum Name {
 }
 
 impl Name {
-    /// As it stands in `peer`.
+    /// Returns the name as a rule writes it in `peer`.
     fn text(&self) -> String {
         match self {
             Self::Host(name) => name.clone(),
@@ -61,7 +61,7 @@ impl Name {
         }
     }
 
-    /// Whether a rule can name it and nobody else.
+    /// Returns whether a rule can name this host or user and nobody else.
     fn is_sayable(&self) -> bool {
         let text = self.text();
         let is = match Principal::parse(&text) {
@@ -76,34 +76,34 @@ impl Name {
 /// What one host or user did.
 #[derive(Debug, Default)]
 struct PartySeen {
-    /// There was an endpoint of this host at the other end.
+    /// Uses for which an endpoint of this host was at the other end.
     used: BTreeSet<Use>,
-    /// There was none.
+    /// Uses for which no endpoint of this host was at the other end.
     alone: BTreeSet<Use>,
-    /// Rules in force deny it.
+    /// Uses that the rules in force deny, each with the reason.
     denied: BTreeMap<Use, String>,
-    /// More that they deny, which status does not list.
+    /// The number of denied uses that the status does not list.
     more_denied: usize,
 }
 
-/// All that was seen so far.
+/// All observations so far.
 #[derive(Debug, Default)]
 pub(super) struct Seen {
     parties: BTreeMap<Name, PartySeen>,
 }
 
 impl Seen {
-    /// Hosts and users, and their uses, so far.
+    /// Returns the number of hosts and users, and the number of their uses.
     pub(super) fn counts(&self) -> (usize, usize) {
         (self.parties.len(), self.parties.values().map(|seen| seen.used.len()).sum())
     }
 
-    /// Whether nobody did anything that rules could speak of.
+    /// Returns whether no use was observed that a rule could concern.
     pub(super) fn is_empty(&self) -> bool {
         self.parties.values().all(|seen| seen.used.is_empty() && seen.denied.is_empty())
     }
 
-    /// Notes all endpoints that there are at one moment.
+    /// Records all endpoints that exist at one time.
     pub(super) fn observe(&mut self, all: &[Observed<'_>]) {
         let mut ends: HashMap<(Verb, &str), Vec<&Observed<'_>>> = HashMap::new();
         for end in all {
@@ -128,7 +128,7 @@ impl Seen {
         }
     }
 
-    /// Notes what the rules in force deny a host, as status lists it.
+    /// Records what the rules in force deny a host, as the status lists it.
     pub(super) fn observe_denied(
         &mut self,
         party: &str,
@@ -149,10 +149,10 @@ impl Seen {
         seen.more_denied = seen.more_denied.max(more);
     }
 
-    /// The rules, as a file that can be used.
+    /// Returns the rules as the text of a rules file.
     ///
     /// # Errors
-    /// What was written does not say what was seen: a defect of this tool.
+    /// The rules do not say what was seen; this is a defect of this tool.
     pub(super) fn rules(&self, sees_all: bool) -> Result<String, String> {
         let mut text = String::from(
             "# Written by axon acl learn: what other hosts and users did here while it watched. Read it before you\n\
@@ -175,7 +175,7 @@ impl Seen {
         Ok(text)
     }
 
-    /// Whether the rules allow what was seen and deny what was denied.
+    /// Checks that the rules allow what was seen and deny what was denied.
     fn check(&self, text: &str) -> Result<(), String> {
         let rules = verify(text)?;
         for (name, seen) in self.parties.iter().filter(|(name, _)| name.is_sayable()) {
@@ -200,7 +200,7 @@ impl Seen {
 }
 
 impl PartySeen {
-    /// The uses that a rule can name and that were not denied.
+    /// Returns the uses that a rule can name and that were not denied.
     fn used(&self) -> impl Iterator<Item = &Use> {
         self.used.iter().filter(|used| is_literal(&used.1) && !self.denied.contains_key(*used))
     }
@@ -283,7 +283,7 @@ impl PartySeen {
     }
 }
 
-/// Whether two endpoints would be a pair that rules decide about.
+/// Returns whether rules decide about the connection of two endpoints.
 fn meet(end: &Observed<'_>, other: &Observed<'_>) -> bool {
     match end.owner {
         Owner::Own => false,
@@ -292,12 +292,12 @@ fn meet(end: &Observed<'_>, other: &Observed<'_>) -> bool {
     }
 }
 
-/// In one line of a comment, whatever the name is.
+/// Returns a use as one line of a comment, with special characters of the name escaped.
 fn shown((verb, name): &Use) -> String {
     printable(&format!("{verb} {name}"))
 }
 
-/// Whether a pattern fits this name and no other.
+/// Returns whether a pattern of this text fits this name and no other.
 fn is_literal(name: &str) -> bool {
     !name.contains('*') && TopicPattern::new(name).is_ok()
 }
@@ -319,7 +319,7 @@ mod tests {
         Observed { owner, session, verb, name }
     }
 
-    /// The base station does this, and something here is at the other end.
+    /// Returns a use by the base station, and the endpoint of this host at the other end.
     fn pair<'a>(verb: Verb, name: &'a str) -> [Observed<'a>; 2] {
         [end(Owner::Host("base"), verb, name), end(Owner::Own, other_end(verb), name)]
     }
@@ -337,9 +337,9 @@ mod tests {
             &[&pair(Verb::Publish, "/cmd_vel")[..], &pair(Verb::Call, "/set")[..], &[alone]]
                 .concat(),
         );
-        // It has gone when they look again.
+        // The endpoint at the other end no longer exists at the second observation.
         seen.observe(&[alone]);
-        // Two others meet each other, and not this host.
+        // These two hosts use the topic with each other, and not with this host.
         let others = [("base", Verb::Publish), ("arm", Verb::Subscribe)];
         seen.observe(&others.map(|(host, verb)| end(Owner::Host(host), verb, "/theirs")));
         assert_eq!(seen.counts(), (2, 2));

@@ -1,4 +1,4 @@
-//! AXON's shared memory, used as its documentation says.
+//! Measures AXON's shared memory, used as its documentation recommends.
 
 use std::{
     os::fd::{AsFd, OwnedFd},
@@ -10,13 +10,13 @@ use axon_transport::qos::Qos;
 
 use super::{Channel, End, Load, Medium, Motion, Result, Side, agree, stamp};
 
-/// Longer than any machine needs to connect.
+/// Any machine connects within this time.
 const CONNECT_TIMEOUT: Option<Duration> = Some(Duration::from_secs(60));
-/// As `Subscriber::recv` sleeps.
+/// The longest sleep of `Subscriber::recv`.
 const LONGEST_SLEEP: Option<Duration> = Some(Duration::from_secs(1));
-/// Up to here what is published is copied in any case, so that `take_into` is the shorter way.
+/// The library copies a published message of up to this size in any case, so `take_into` is faster.
 const COPIED: usize = 4096;
-/// Up to here what is loaned is copied, too, so that `publish` is the shorter way.
+/// The library also copies a loan of up to this size, so `publish` is faster.
 const LOANS_COPIED: usize = 512;
 
 /// `axon_shm` without a daemon, RELIABLE and KEEP_LAST.
@@ -30,14 +30,15 @@ impl Medium for Axon {
     fn open(&self, load: &Load, side: Side, channel: &Channel) -> Result<Box<dyn End>> {
         let context = Context::new()?;
         let qos = qos(load.window)?;
-        // All that may be under way must fit, or the oldest go. Samples count in whole lines.
+        // The budget must hold all messages in transit; otherwise the oldest are lost. Samples
+        // occupy whole cache lines.
         let budget = (load.window * load.size * 5 / 4).max(64 << 20) as u64;
         let options = PublisherOptions::new(qos).budget(budget).expected_len(load.size as u64);
         let publisher = Publisher::new(&context, options)?;
         let connect = |socket: &OwnedFd| {
             Subscriber::connect(&context, socket, SubscriberOptions::new(qos), CONNECT_TIMEOUT)
         };
-        // A socket for each direction.
+        // Each direction has its own socket.
         let subscriber = match side {
             Side::Near => {
                 let [(there, first), (back, second)] = [Channel::pair()?, Channel::pair()?];
@@ -68,7 +69,7 @@ impl Medium for Axon {
     }
 }
 
-/// The default profile, with a history of `window` samples at least.
+/// Returns the default profile with a history of at least `window` samples.
 pub(crate) fn qos(window: usize) -> Result<Qos> {
     let qos = Qos::default();
     Ok(qos.with_depth(qos.depth.max(u32::try_from(window)?)))
@@ -82,7 +83,8 @@ struct AxonEnd {
     sleeps: bool,
     loans: bool,
     copies: bool,
-    /// What is sent, and what is received: one buffer, as the raw limit and other media have.
+    /// The buffer for messages sent and received. The raw limit and other media have one buffer as
+    /// well.
     bytes: Vec<u8>,
 }
 

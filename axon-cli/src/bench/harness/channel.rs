@@ -1,4 +1,4 @@
-//! The socket by which the two processes agree on what comes next.
+//! The socket over which the two processes of a measurement coordinate.
 
 use std::{
     io::{IoSlice, IoSliceMut},
@@ -22,18 +22,19 @@ const ENDED: &str = "the other process has ended";
 const LARGEST: usize = 4096;
 const MOST_DESCRIPTORS: usize = 4;
 
-/// One end of a connected socket that keeps packets apart.
+/// One end of a connected socket that preserves packet boundaries.
 pub(crate) struct Channel(OwnedFd);
 
 impl Channel {
-    /// Both ends: ours, and one to be the standard input of the other process.
+    /// Creates both ends: one for this process, and one that becomes the standard input of the
+    /// other process.
     pub(crate) fn pair() -> Result<(Self, OwnedFd)> {
         let flags = SocketFlags::CLOEXEC;
         let (ours, theirs) = socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, flags, None)?;
         Ok((Self(ours), theirs))
     }
 
-    /// The end that this process was given as its standard input.
+    /// Returns the end that this process received as its standard input.
     pub(crate) fn inherited() -> Result<Self> {
         Ok(Self(std::io::stdin().as_fd().try_clone_to_owned()?))
     }
@@ -58,18 +59,18 @@ impl Channel {
         }
     }
 
-    /// Awaits a packet.
+    /// Waits for a packet.
     pub(crate) fn hear<T: DeserializeOwned>(&self) -> Result<T> {
         self.take_over().map(|(packet, _)| packet)
     }
 
-    /// Whether a packet is here, or the other process has ended.
+    /// Returns whether a packet has arrived or the other process has ended.
     pub(crate) fn is_readable(&self) -> Result<bool> {
         let mut fds = [PollFd::new(&self.0, PollFlags::IN)];
         Ok(poll(&mut fds, Some(&Timespec::default()))? > 0)
     }
 
-    /// Awaits a packet and what descriptors it carries.
+    /// Waits for a packet and the descriptors that it carries.
     pub(crate) fn take_over<T: DeserializeOwned>(&self) -> Result<(T, Vec<OwnedFd>)> {
         let mut bytes = [0; LARGEST];
         let mut space = [MaybeUninit::uninit(); rustix::cmsg_space!(ScmRights(MOST_DESCRIPTORS))];
@@ -117,7 +118,7 @@ mod tests {
         drop(other);
         assert_eq!(channel.tell(&"go on").unwrap_err().to_string(), ENDED);
         assert_eq!(channel.hear::<String>().unwrap_err().to_string(), ENDED);
-        // A packet that it had not read.
+        // The other end did not read this packet.
         let (channel, other) = Channel::pair().unwrap();
         channel.tell(&"go on").unwrap();
         drop(other);

@@ -1,4 +1,4 @@
-//! Lines over logarithmic axes, in SVG.
+//! Draws lines over logarithmic axes, in SVG.
 
 use std::fmt::Write as _;
 
@@ -10,10 +10,10 @@ const COLORS: [&str; 5] = ["#8c959f", "#0969da", "#cf222e", "#1a7f37", "#9a6700"
 const WIDTH: f64 = 480.0;
 const HEIGHT: f64 = 320.0;
 const HEADER: f64 = 64.0;
-/// Around the plot of a chart: left, top, right, bottom.
+/// The margins around the plot of a chart: left, top, right, bottom.
 const MARGINS: [f64; 4] = [64.0, 34.0, 16.0, 40.0];
 
-/// One line of a chart: a name, and points from left to right, both axes above zero.
+/// One line of a chart: a name, and points from left to right. Both coordinates are above zero.
 pub(crate) struct Line {
     pub(crate) name: String,
     pub(crate) points: Vec<(f64, f64)>,
@@ -22,15 +22,16 @@ pub(crate) struct Line {
 /// A chart.
 pub(crate) struct Chart {
     pub(crate) title: String,
-    /// In their order they have the same colours in all charts.
+    /// The lines. A line's position decides its colour, which is the same in all charts.
     pub(crate) lines: Vec<Line>,
-    /// What a value of the horizontal axis is called; those that have a point are.
+    /// Returns the label of a value on the horizontal axis. Each value that has a point is
+    /// labelled.
     pub(crate) across: fn(f64) -> String,
-    /// What a value of the vertical axis is called; powers of ten are.
+    /// Returns the label of a value on the vertical axis. Powers of ten are labelled.
     pub(crate) upwards: fn(f64) -> String,
 }
 
-/// Charts, two in a row, under a title and a line that says what they are of.
+/// Draws charts, two in a row, under a title and a subtitle.
 pub(crate) fn page(title: &str, subtitle: &str, charts: &[Chart]) -> String {
     let (width, height) = (2.0 * WIDTH, HEADER + charts.len().div_ceil(2) as f64 * HEIGHT);
     let mut svg = format!(

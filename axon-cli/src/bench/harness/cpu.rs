@@ -4,15 +4,15 @@ use std::fs;
 
 use rustix::time::{ClockId, clock_gettime};
 
-/// Processor time of this process so far, in all its threads, ended threads included.
+/// Returns the processor time of this process so far, in all its threads, including ended threads.
 pub(crate) fn own() -> f64 {
     let time = clock_gettime(ClockId::ProcessCPUTime);
     time.tv_sec as f64 + time.tv_nsec as f64 / 1e9
 }
 
-/// Processor time of process `pid` so far, in the threads that it has now.
+/// Returns the processor time of process `pid` so far, in its current threads.
 ///
-/// The kernel accounts for a thread when it sleeps, and at each tick while it runs: exact for a process
+/// The kernel accounts for a thread when it sleeps, and at each tick while it runs. The result is exact for a process
 /// that sleeps between messages.
 pub(crate) fn of(pid: u32) -> f64 {
     let tasks = fs::read_dir(format!("/proc/{pid}/task"));

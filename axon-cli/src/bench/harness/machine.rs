@@ -1,4 +1,4 @@
-//! The machine that the figures are of.
+//! The machine on which figures are measured.
 
 use std::fs;
 
@@ -10,31 +10,31 @@ use serde::Serialize;
 
 use super::Result;
 
-/// What a reader of the figures must know of the machine.
+/// The properties of the machine that affect the figures.
 #[derive(Clone, Debug, Serialize)]
 pub(crate) struct Machine {
     pub(crate) host: String,
     pub(crate) kernel: String,
     pub(crate) architecture: String,
     pub(crate) cpu: String,
-    /// How many CPUs this process may use.
+    /// The number of CPUs that this process may use.
     pub(crate) cpus: usize,
-    /// Which.
+    /// The CPUs that this process may use.
     #[serde(skip)]
     pub(super) allowed: Vec<usize>,
-    /// The CPU of the process that measures and that of the other one.
+    /// The CPUs of the process that measures and of the other process.
     pub(crate) pinned: [usize; 2],
-    /// Processes that ran or wanted to in the minute before.
+    /// The average number of running and waiting processes in the minute before.
     pub(crate) load_before: f64,
-    /// What one look at the clock takes; it is taken off each time.
+    /// The time that one reading of the clock takes. It is subtracted from each measured time.
     pub(crate) clock_ns: f64,
 }
 
 impl Machine {
-    /// This one.
+    /// Returns the machine on which this process runs.
     ///
     /// # Errors
-    /// It has one CPU only, where two processes cannot poll for each other.
+    /// The process may use only one CPU, on which two processes cannot poll for each other.
     pub(crate) fn look() -> Result<Self> {
         let system = uname();
         let text = |field: &std::ffi::CStr| field.to_string_lossy().into_owned();
@@ -56,25 +56,24 @@ impl Machine {
         })
     }
 
-    /// Lets this thread run wherever the process may, after a [`Pair`](super::Pair) has kept it on one
-    /// CPU.
+    /// Lets this thread run on all CPUs that the process may use, after a [`Pair`](super::Pair) has pinned it to one.
     pub(crate) fn release(&self) -> Result<()> {
         unpin(&self.allowed)
     }
 
-    /// Keeps this thread on the CPU of the process that measures.
+    /// Pins this thread to the CPU of the process that measures.
     pub(crate) fn near(&self) -> Result<()> {
         pin(self.pinned[0])
     }
 
-    /// Keeps this thread, and the processes that it starts from now on, off that CPU.
+    /// Excludes this thread, and the processes that it starts from now on, from the CPU of the process that measures.
     pub(crate) fn beside(&self) -> Result<()> {
         let near = self.pinned[0];
         let others: Vec<usize> = self.allowed.iter().copied().filter(|cpu| *cpu != near).collect();
         unpin(&others)
     }
 
-    /// One line for people.
+    /// Returns the machine as one line of text.
     pub(crate) fn line(&self) -> String {
         format!(
             "{} ({}), {}, {} CPUs, processes pinned to {} and {}, load before {:.2}, clock {:.0} ns",
@@ -90,14 +89,14 @@ impl Machine {
     }
 }
 
-/// Keeps this thread, and those that it starts from now on, on one CPU.
+/// Pins this thread, and the threads that it starts from now on, to one CPU.
 pub(super) fn pin(cpu: usize) -> Result<()> {
     let mut set = CpuSet::new();
     set.set(cpu);
     Ok(sched_setaffinity(None, &set)?)
 }
 
-/// Lets this thread run wherever `cpus` says.
+/// Lets this thread run on `cpus`.
 pub(super) fn unpin(cpus: &[usize]) -> Result<()> {
     let mut set = CpuSet::new();
     cpus.iter().for_each(|cpu| set.set(*cpu));

@@ -1,31 +1,31 @@
-//! From single times to what is reported.
+//! Computes the reported figures from single times.
 
 use std::time::{Duration, Instant};
 
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 
-/// Those that are reported, in percent.
+/// The reported percentiles, in percent.
 pub(crate) const PERCENTILES: [f64; 13] =
     [0.0, 1.0, 5.0, 10.0, 25.0, 50.0, 75.0, 90.0, 95.0, 99.0, 99.9, 99.99, 100.0];
 
-/// How long to measure.
+/// The length of a measurement.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Effort {
-    /// Turns of each medium.
+    /// The turns of each medium.
     pub(crate) rounds: usize,
-    /// Length of a turn, about.
+    /// The approximate length of a turn.
     pub(crate) turn: Duration,
-    /// Messages of a turn at least, and at most.
+    /// The fewest and the most messages of a turn.
     pub(crate) messages: [u64; 2],
-    /// Turns of each medium where messages have a pace.
+    /// The turns of each medium under a load with a pace.
     pub(crate) paced_rounds: usize,
-    /// Messages of such a turn.
+    /// The messages of a turn under a load with a pace.
     pub(crate) paced_messages: u64,
 }
 
 impl Effort {
-    /// For figures.
+    /// The effort for figures to report.
     pub(crate) const FULL: Self = Self {
         rounds: 21,
         turn: Duration::from_millis(10),
@@ -33,7 +33,7 @@ impl Effort {
         paced_rounds: 5,
         paced_messages: 100,
     };
-    /// To see it run.
+    /// The effort for a trial run.
     pub(crate) const QUICK: Self = Self {
         rounds: 3,
         turn: Duration::from_millis(1),
@@ -42,7 +42,7 @@ impl Effort {
         paced_messages: 4,
     };
 
-    /// How many messages fill a turn when `messages` took `elapsed`.
+    /// Returns how many messages fill a turn if `messages` took `elapsed`.
     pub(crate) fn count(&self, messages: u64, elapsed: Duration) -> u64 {
         let [least, most] = self.messages;
         let each = (elapsed.as_secs_f64() / messages as f64).max(1e-9);
@@ -50,23 +50,24 @@ impl Effort {
     }
 }
 
-/// One turn's times in nanoseconds.
+/// The times of one turn, or of several, in nanoseconds.
 #[derive(Clone, Debug)]
 pub(crate) struct Summary {
-    /// How many times there were.
+    /// The number of times.
     pub(crate) count: usize,
     pub(crate) mean: f64,
-    /// At [`PERCENTILES`].
+    /// The times at [`PERCENTILES`].
     pub(crate) at: [f64; PERCENTILES.len()],
 }
 
 impl Summary {
-    /// The median of the turn's times.
+    /// Returns the median of the times.
     pub(crate) fn p50(&self) -> f64 {
         self.at[5]
     }
 
-    /// A percentile of [`PERCENTILES`], where there were enough times to tell it from the worst.
+    /// Returns a percentile of [`PERCENTILES`], if there were enough times to distinguish it from
+    /// the maximum.
     pub(crate) fn tail(&self, percent: f64) -> Option<f64> {
         let index = PERCENTILES.iter().position(|p| *p == percent)?;
         let beyond = self.count as f64 * (100.0 - percent) / 100.0;
@@ -91,7 +92,7 @@ fn tenths(ns: f64) -> f64 {
     (ns * 10.0).round() / 10.0
 }
 
-/// Sums times up, and sorts them.
+/// Sorts times and summarizes them.
 fn summarize(times: &mut [f64]) -> Summary {
     times.sort_by(f64::total_cmp);
     let last = times.len() - 1;
@@ -106,41 +107,41 @@ pub(crate) struct Rounds {
     turns: Vec<Summary>,
     /// The times of all turns.
     times: Vec<f64>,
-    /// Processor time of a message, by turns, in nanoseconds.
+    /// The processor time of a message in each turn, in nanoseconds.
     cpu: Vec<f64>,
 }
 
 impl Rounds {
-    /// Adds a turn's times, and the nanoseconds of processor time that a message took in all
-    /// processes.
+    /// Adds a turn's times, and the processor time of a message in all processes, in nanoseconds.
     pub(crate) fn add(&mut self, mut times: Vec<f64>, cpu: f64) {
         self.turns.push(summarize(&mut times));
         self.times.append(&mut times);
         self.cpu.push(cpu);
     }
 
-    /// Nanoseconds of processor time of a message, in all processes: the median of the turns.
+    /// Returns the processor time of a message in all processes, in nanoseconds, as the median of
+    /// the turns.
     pub(crate) fn cpu(&self) -> f64 {
         median(self.cpu.clone())
     }
 
-    /// All times together, whatever disturbed the machine meanwhile among them.
+    /// Returns a summary of all times, including those that the machine disturbed.
     pub(crate) fn all(&self) -> Summary {
         summarize(&mut self.times.clone())
     }
 
-    /// The turn with the least median: the one that was disturbed least.
+    /// Returns the turn with the smallest median, which was disturbed least.
     pub(crate) fn best(&self) -> &Summary {
         let least = |a: &&Summary, b: &&Summary| a.p50().total_cmp(&b.p50());
         self.turns.iter().min_by(least).expect("there is a round at least")
     }
 
-    /// The median of the turns' medians.
+    /// Returns the median of the turns' medians.
     pub(crate) fn typical(&self) -> f64 {
         median(self.turns.iter().map(Summary::p50).collect())
     }
 
-    /// The best turn, and all of them.
+    /// Returns the best turn and all turns.
     pub(crate) fn json(&self) -> Value {
         json!({
             "best_round": self.best().json(),
@@ -151,30 +152,30 @@ impl Rounds {
         })
     }
 
-    /// How many times what `limit` took this one took.
+    /// Returns the ratio of these times to those of `limit`.
     pub(crate) fn to(&self, limit: &Self) -> Ratio {
         let rounds = self.turns.iter().zip(&limit.turns).map(|(own, of)| own.p50() / of.p50());
         Ratio { best: self.best().p50() / limit.best().p50(), median: median(rounds.collect()) }
     }
 }
 
-/// How many times longer one took than the other.
+/// The ratio of one medium's times to another's.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub(crate) struct Ratio {
-    /// Of the best turns.
+    /// The ratio of the best turns.
     pub(crate) best: f64,
     /// The median of the rounds' ratios.
     pub(crate) median: f64,
 }
 
-/// The median of `values`, which are not empty.
+/// Returns the median of `values`, which must not be empty.
 pub(crate) fn median(mut values: Vec<f64>) -> f64 {
     values.sort_by(f64::total_cmp);
     values[values.len() / 2]
 }
 
-/// What one look at the clock takes, in nanoseconds: taken off each time, for there is one look a
-/// message.
+/// Returns the time that one reading of the clock takes, in nanoseconds. It is subtracted from each
+/// time, because each message needs one reading.
 pub(crate) fn clock_cost() -> f64 {
     const LOOKS: u32 = 10_000;
     let batch = || {

@@ -1,9 +1,9 @@
-//! Measures ways to get bytes from one process to another and back, each beside the raw limit and
-//! in turns with it, so that whatever disturbs the machine hits all of them.
+//! Measures methods of transferring bytes from one process to another and back. Each takes turns with the raw limit, so
+//! that a disturbance of the machine affects all of them.
 //!
-//! A [`Medium`] is such a way, an [`End`] what one of the two processes holds of it. [`Pair`] is
-//! the process that measures, [`serve`](serve()) the one that answers. The comparison with other middlewares (`bench-peers/`) includes this folder
-//! and adds its media.
+//! A [`Medium`] is one method, and an [`End`] is the state of it that one of the two processes holds. [`Pair`] is the
+//! process that measures, and [`serve`](serve()) is the process that answers. The comparison with other middlewares
+//! (`bench-peers/`) includes this folder and adds its media.
 
 mod axon;
 mod channel;
@@ -31,11 +31,11 @@ pub(crate) use progress::Progress;
 pub(crate) use raw::{Raw, SharedPages, Sleeps};
 pub(crate) use serve::{now_ns, serve};
 
-/// Whatever stops a measurement.
+/// An error that ends a measurement.
 pub(crate) type Error = Box<dyn std::error::Error + Send + Sync>;
-/// What it stops.
+/// The result of a step of a measurement.
 pub(crate) type Result<T> = std::result::Result<T, Error>;
 
-/// Sizes that are measured unless others are asked for, in bytes.
+/// The sizes that are measured by default, in bytes.
 pub(crate) const SIZES: [usize; 10] =
     [8, 64, 1 << 10, 4 << 10, 16 << 10, 64 << 10, 256 << 10, 1 << 20, 4 << 20, 25_000_000];

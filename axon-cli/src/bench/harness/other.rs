@@ -1,4 +1,4 @@
-//! The process on the other side.
+//! The other process of a measurement.
 
 use std::{
     env,
@@ -13,16 +13,16 @@ use std::{
 use super::{Channel, Result};
 use crate::say::say;
 
-/// A process that was started to be on the other side.
+/// A process that was started as the other side.
 pub(crate) struct Other {
     channel: Option<Channel>,
     over: Arc<AtomicBool>,
     watch: Option<JoinHandle<()>>,
 }
 
-/// Starts this program again with `arguments`, which must lead it to the other side. It ends when
-/// what is returned is dropped. If it ends before, so does this process: it may be in the middle of
-/// a loop that nobody else ends.
+/// Starts this program again with `arguments`, which must make it the other side. The process ends
+/// when the returned value is dropped. If it ends earlier, this process exits too, because this
+/// process may be in a loop that nothing else ends.
 pub(crate) fn spawn(arguments: &[&str]) -> Result<Other> {
     let (channel, theirs) = Channel::pair()?;
     let mut child =
@@ -40,7 +40,7 @@ pub(crate) fn spawn(arguments: &[&str]) -> Result<Other> {
 }
 
 impl Other {
-    /// The socket to it.
+    /// Returns the socket to the other process.
     pub(crate) fn channel(&self) -> &Channel {
         self.channel.as_ref().expect("open until it is dropped")
     }

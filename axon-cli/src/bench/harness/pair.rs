@@ -1,4 +1,4 @@
-//! The process that measures, and how it has the other one answer.
+//! The process that measures, and its control of the process that answers.
 
 use std::{
     os::fd::AsFd,
@@ -15,11 +15,10 @@ use super::{
     spawn,
 };
 
-/// Turns of the wait for credit before the CPU is offered to others: a medium's own threads may
-/// need it.
+/// The number of polls for credit before this thread yields the CPU, which a medium's own threads may need.
 const SPINS: u32 = 200_000;
 
-/// The process that measures, with the other one at its service.
+/// The process that measures, with its connection to the process that answers.
 pub(crate) struct Pair<'a> {
     media: &'a [&'a dyn Medium],
     effort: Effort,
@@ -30,7 +29,7 @@ pub(crate) struct Pair<'a> {
     other: Other,
 }
 
-/// A medium's end while its turns are taken.
+/// An open end of a medium, while its turns are taken.
 struct Contestant<'a> {
     index: usize,
     medium: &'a dyn Medium,
@@ -39,12 +38,11 @@ struct Contestant<'a> {
     daemons: Vec<u32>,
 }
 
-/// What a turn gave, and how many messages went one way meanwhile.
+/// The result of a turn, and the number of messages sent one way during it.
 type Turn<T> = (T, u64);
 
 impl<'a> Pair<'a> {
-    /// Starts the other process, in which `arguments` must lead to [`serve`](super::serve()) with the
-    /// same media.
+    /// Starts the other process. `arguments` must make it call [`serve`](super::serve()) with the same media.
     pub(crate) fn start(
         media: &'a [&'a dyn Medium],
         effort: Effort,
@@ -59,7 +57,7 @@ impl<'a> Pair<'a> {
         Ok(Self { media, effort, clock: machine.clock_ns, cpu: near, cpus, board, other })
     }
 
-    /// Nanoseconds of half a round trip, for each medium that carries this.
+    /// Measures half a round trip in nanoseconds, for each medium that carries `load`.
     pub(crate) fn latency(&self, load: &Load) -> Result<Vec<Rounds>> {
         self.by_turns(load, |of, count| {
             let cold = count / 16 + 1;
@@ -79,15 +77,15 @@ impl<'a> Pair<'a> {
         })
     }
 
-    /// Nanoseconds from message to message in a stream that the receiver keeps up with.
+    /// Measures the nanoseconds from message to message in a stream whose receiver keeps up.
     pub(crate) fn stream(&self, load: &Load) -> Result<Vec<Rounds>> {
         self.by_turns(load, |of, count| {
             let credit = self.board.word(0);
             let window = load.window as u64;
-            // All that was sent before has been taken: the other one said that it is done.
+            // The other process has taken all messages of earlier turns, because it reported the end of each turn.
             let taken_before = credit.load(Ordering::Acquire);
             self.channel().tell(&BenchCommand::Take { medium: of.index, count })?;
-            // From here on the other one is awake.
+            // After this packet the other process is awake.
             self.channel().hear::<()>()?;
             let start = Instant::now();
             for index in 0..count {
@@ -99,8 +97,8 @@ impl<'a> Pair<'a> {
         })
     }
 
-    /// Nanoseconds from just before a message is sent to when it was taken, one message every
-    /// `load.pace`: both processes sleep in between.
+    /// Measures the nanoseconds from just before a message is sent until it is taken. One message is sent every
+    /// `load.pace`, and both processes sleep in between.
     pub(crate) fn paced(&self, load: &Load) -> Result<Vec<Rounds>> {
         let pace = load.pace.ok_or("a load without a pace")?;
         let channel = self.channel();
@@ -136,14 +134,14 @@ impl<'a> Pair<'a> {
         })
     }
 
-    /// All media that carry a load, a turn each per round, beginning with another one each time.
+    /// Measures all media that carry a load. Each has one turn per round, and each round begins with another medium.
     fn by_turns(
         &self,
         load: &Load,
         turn: impl Fn(&mut Contestant<'_>, u64) -> Result<Turn<Vec<f64>>>,
     ) -> Result<Vec<Rounds>> {
         self.open(load, |mut all| {
-            // The second time all is warm, and the least of the three was disturbed least.
+            // After the first of three turns all caches are warm. The shortest of the three was disturbed least.
             let mut counts = Vec::new();
             for of in &mut all {
                 let mut count = 4;
@@ -173,7 +171,7 @@ impl<'a> Pair<'a> {
         })
     }
 
-    /// Has both processes open their ends for a load, and close them after `measure`.
+    /// Makes both processes open their ends for a load, and close them after `measure`.
     fn open(
         &self,
         load: &Load,
@@ -200,8 +198,7 @@ impl<'a> Pair<'a> {
         Ok(rounds)
     }
 
-    /// What a turn gave, and the nanoseconds of processor time that a message took in it, of all
-    /// processes together.
+    /// Takes a turn. Returns its result and the processor time of a message in all processes together, in nanoseconds.
     fn spent<T>(
         &self,
         of: &mut Contestant<'_>,

@@ -1,4 +1,4 @@
-//! Progress on standard error: a bar on a terminal, else a line a step.
+//! Shows progress on standard error: a bar on a terminal, otherwise a line for each step.
 
 use std::io::IsTerminal;
 
@@ -6,14 +6,14 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::say::say;
 
-/// A run's progress. Nothing moves while something is measured.
+/// The progress of a run. The display does not change during a measurement.
 pub(crate) struct Progress {
     bar: ProgressBar,
     lines: bool,
 }
 
 impl Progress {
-    /// Over so many loads.
+    /// Starts the display of a run with this number of loads.
     pub(crate) fn new(loads: usize) -> Self {
         let bar = ProgressBar::new(loads as u64);
         if let Ok(style) =
@@ -24,7 +24,7 @@ impl Progress {
         Self { bar, lines: !std::io::stderr().is_terminal() }
     }
 
-    /// What is measured from now on.
+    /// Shows the measurement that begins now.
     pub(crate) fn step(&self, what: &str) {
         if self.lines {
             say(what);
@@ -32,7 +32,7 @@ impl Progress {
         self.bar.set_message(what.to_owned());
     }
 
-    /// A load is over.
+    /// Counts a load as measured.
     pub(crate) fn advance(&self) {
         self.bar.inc(1);
     }

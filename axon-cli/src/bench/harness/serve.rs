@@ -10,33 +10,32 @@ use serde::{Deserialize, Serialize};
 
 use super::{Channel, End, Error, Load, Medium, Result, Side, cpu, machine, raw::SharedPages};
 
-/// Messages of a paced turn at most: each has a word of the board.
+/// The most messages of a paced turn. Each has a word on the board.
 pub(super) const MOST_PACED: u64 = 1024;
-/// Bytes of the memory that both processes share beside their media: the credit word, and the time at
-/// which each message of a paced turn was taken.
+/// The length in bytes of the board, the memory that both processes share apart from their media. It holds the credit
+/// word, and the time at which each message of a paced turn was taken.
 pub(super) const BOARD: usize = 8 * (1 + MOST_PACED as usize);
 
-/// What the process that measures has the other one do. Each turn is answered by the processor time
-/// that it took, in seconds.
+/// A command of the process that measures. The answer to each turn is the processor time that it took, in seconds.
 #[derive(Serialize, Deserialize)]
 pub(super) enum BenchCommand {
     Open(Load),
-    /// Send each of so many messages back.
+    /// Send back each of `count` messages.
     Answer {
         medium: usize,
         count: u64,
     },
-    /// Take so many messages and say by the credit word how many they are in all.
+    /// Take `count` messages, and report the total number of messages taken in the credit word.
     Take {
         medium: usize,
         count: u64,
     },
-    /// Take so many messages and note on the board when each came.
+    /// Take `count` messages, and write on the board when each arrived.
     Note {
         medium: usize,
         count: u64,
     },
-    /// Go to this CPU until the next is opened.
+    /// Run on this CPU until the next load is opened.
     Move(usize),
     Close,
 }
@@ -47,26 +46,26 @@ pub(super) struct Hello {
     pub(super) cpus: Vec<usize>,
 }
 
-/// Where on the board the time of a message is, counted from zero.
+/// Returns the position on the board of the time of a message. Messages count from zero.
 pub(super) fn noted(index: u64) -> usize {
     8 * (1 + index as usize)
 }
 
-/// Nanoseconds of the clock that all processes share.
+/// Returns the nanoseconds of the monotonic clock, which all processes share.
 pub(crate) fn now_ns() -> u64 {
     let now = clock_gettime(ClockId::Monotonic);
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
 }
 
-/// Is the other process, until the one that measures ends.
+/// Runs the process that answers, until the process that measures ends.
 pub(crate) fn serve(all: &[&dyn Medium]) -> Result<()> {
-    // In the middle of a loop nobody else would end this process.
+    // In the middle of a loop this process would not notice that the other one has ended.
     set_parent_process_death_signal(Some(Signal::KILL))?;
     let channel = Channel::inherited()?;
     let (Hello { cpu, cpus }, fds) = channel.take_over()?;
     let [fd] = fds.try_into().map_err(|_| "another number of descriptors")?;
     let board = SharedPages::map(&fd, BOARD)?;
-    // Each with the number of the last message.
+    // Each end, with the number of its last message.
     let mut ends: Vec<(Box<dyn End>, u64)> = Vec::new();
     let mut media = Vec::new();
     let mut window = 1;
@@ -104,7 +103,7 @@ pub(crate) fn serve(all: &[&dyn Medium]) -> Result<()> {
                 for index in 1..=count {
                     next(&mut **end, last).map_err(|error| named(media[medium], error))?;
                     if index == count || index.is_multiple_of(window / 4) {
-                        // Pairs with the load of the one that waits for it.
+                        // Pairs with the Acquire load in `await_credit`.
                         word.store(taken + index, Ordering::Release);
                     }
                 }
@@ -118,7 +117,7 @@ pub(crate) fn serve(all: &[&dyn Medium]) -> Result<()> {
                 for index in 0..count {
                     next(&mut **end, last).map_err(|error| named(media[medium], error))?;
                     board.word(noted(index)).store(now_ns(), Ordering::Relaxed);
-                    // Pairs with the load of the one that waits for it.
+                    // Pairs with the Acquire load in `await_credit`.
                     word.store(taken + index + 1, Ordering::Release);
                 }
                 channel.tell(&(cpu::own() - before))?;
@@ -135,7 +134,7 @@ pub(crate) fn serve(all: &[&dyn Medium]) -> Result<()> {
     }
 }
 
-/// Those that have a part under `load`, the same on both sides.
+/// Returns the media that take part under `load`. They are the same on both sides.
 pub(super) fn carrying<'a>(media: &[&'a dyn Medium], load: &Load) -> Vec<&'a dyn Medium> {
     media.iter().copied().filter(|medium| medium.carries(load)).collect()
 }

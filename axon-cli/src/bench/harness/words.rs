@@ -1,11 +1,11 @@
-//! What loads are called.
+//! The texts that name loads, sizes and times in reports.
 
 use std::time::Duration;
 
 use super::{Load, Motion, Wake};
 use crate::text;
 
-/// How a receiver learns of a message, and what becomes of its bytes.
+/// Names how a receiver learns of a message, and how its bytes move.
 pub(crate) fn kind(wake: Wake, how: Motion) -> String {
     let wake = match wake {
         Wake::Poll => "polling",
@@ -15,7 +15,7 @@ pub(crate) fn kind(wake: Wake, how: Motion) -> String {
     format!("{wake}, {}", motion(how))
 }
 
-/// What becomes of a message's bytes.
+/// Names how a message's bytes move.
 pub(crate) fn motion(motion: Motion) -> &'static str {
     match motion {
         Motion::Touch => "in place",
@@ -24,7 +24,7 @@ pub(crate) fn motion(motion: Motion) -> &'static str {
     }
 }
 
-/// What the raw limit consists of.
+/// Names the operations of the raw limit.
 pub(crate) fn limit(wake: Wake, motion: Motion) -> String {
     let wake = match wake {
         Wake::Poll => "a spin on a shared atomic",
@@ -38,7 +38,7 @@ pub(crate) fn limit(wake: Wake, motion: Motion) -> String {
     }
 }
 
-/// A size, in binary units where it is a round number of them.
+/// Formats a size, in binary units if it is a multiple of one.
 pub(crate) fn size(bytes: usize) -> String {
     match bytes {
         b if b >= 1 << 20 && b.is_multiple_of(1 << 20) => format!("{} MiB", b >> 20),
@@ -47,7 +47,7 @@ pub(crate) fn size(bytes: usize) -> String {
     }
 }
 
-/// Bytes a second at `rate` messages a second, where they are moved.
+/// Formats the bytes per second at `rate` messages per second, if the bytes are copied.
 pub(crate) fn throughput(load: &Load, rate: f64) -> String {
     match load.motion {
         Motion::Touch => "-".to_owned(),
@@ -55,7 +55,7 @@ pub(crate) fn throughput(load: &Load, rate: f64) -> String {
     }
 }
 
-/// How often messages come.
+/// Formats the frequency of messages.
 pub(crate) fn pace(pace: Duration) -> String {
     match 1e9 / pace.as_nanos() as f64 {
         hz if hz >= 1000.0 => format!("{} kHz", hz / 1000.0),
@@ -63,7 +63,7 @@ pub(crate) fn pace(pace: Duration) -> String {
     }
 }
 
-/// A time.
+/// Formats a time.
 pub(crate) fn nanoseconds(ns: f64) -> String {
     text::duration(ns.max(0.0).round() as u64)
 }

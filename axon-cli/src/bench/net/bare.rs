@@ -1,6 +1,6 @@
-//! The raw limit between two hosts: one stream of bare quinn, under AXON's key exchange and cipher, with a
-//! daemon's socket buffers and send window. Messages have a length before them; in a stream they are written 64 KiB at a time,
-//! and always read so.
+//! The raw limit between two hosts: one stream of bare quinn, with AXON's key exchange and cipher, and with a daemon's
+//! socket buffers and send window. A length precedes each message. In a stream, messages are written in batches of 64
+//! KiB. They are always read in such batches.
 
 use std::{
     net::{Ipv4Addr, UdpSocket},
@@ -23,21 +23,22 @@ use tokio::runtime::Runtime;
 
 use crate::bench::harness::{Channel, End, Error, Load, Medium, Result, Side, agree, stamp};
 
-/// Bytes of a write in a stream, and of a read.
+/// The bytes of one write in a stream, and of one read.
 const BATCH: usize = 64 << 10;
 const HEADER: usize = 4;
-/// Between two looks at whether a turn is over.
+/// The time between two checks whether a turn is over.
 const CHECK_INTERVAL: Duration = Duration::from_millis(1);
-/// As a daemon's.
+/// The size of a socket buffer, the same as a daemon's.
 const SOCKET_BUFFER: usize = 8 << 20;
-/// As a daemon's.
+/// The send window, the same as a daemon's.
 const SEND_WINDOW: u64 = 16 << 20;
-/// Wider than a daemon's (at most 4 MiB), which has many peers: a user of quinn alone has one.
+/// The receive window of a stream. It is wider than a daemon's (at most 4 MiB), which has many peers; this stream has
+/// one.
 const STREAM_WINDOW: u32 = 32 << 20;
-/// Wider than a daemon's too (1 MiB and a share of 64 MiB).
+/// The receive window of the connection, also wider than a daemon's (1 MiB and a share of 64 MiB).
 const CONNECTION_WINDOW: u32 = 256 << 20;
 
-/// quinn and nothing else.
+/// A medium of quinn alone.
 pub(super) struct BareQuic;
 
 impl Medium for BareQuic {
@@ -50,12 +51,12 @@ impl Medium for BareQuic {
     }
 }
 
-/// Which threads run quinn.
+/// The threads that run quinn.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) enum Threads {
-    /// The one that waits for a message: no other has to be woken.
+    /// The thread that waits for a message runs quinn, so no other thread has to be woken.
     One,
-    /// One of its own: it encrypts while the application makes messages.
+    /// A separate thread runs quinn. It encrypts while the application makes messages.
     Two,
 }
 
@@ -63,11 +64,11 @@ pub(super) enum Threads {
 pub(super) struct BareEnd {
     out: SendStream,
     into: RecvStream,
-    /// Queued and not handed to quinn yet.
+    /// Bytes that are queued and were not yet handed to quinn.
     unsent: Vec<u8>,
     unread: Unread,
     bytes: Vec<u8>,
-    /// Nothing is received after a message that would run quinn.
+    /// The load has a pace. After a message this end receives nothing, so no call would run quinn.
     is_paced: bool,
     _connection: Connection,
     endpoint: Endpoint,
@@ -75,7 +76,7 @@ pub(super) struct BareEnd {
 }
 
 impl BareEnd {
-    /// Meets the other side.
+    /// Connects to the other side.
     pub(super) fn open(
         load: &Load,
         side: Side,
@@ -131,7 +132,7 @@ impl BareEnd {
             endpoint,
             runtime,
         };
-        // The far side's first byte goes once its thread runs quinn again.
+        // The far side's first byte is sent when its thread next runs quinn.
         match side {
             Side::Near => channel.tell(&())?,
             Side::Far => {
@@ -142,7 +143,7 @@ impl BareEnd {
         Ok(end)
     }
 
-    /// Writes a message, which goes once 64 KiB are together.
+    /// Writes a message. It is sent once 64 KiB have accumulated.
     pub(super) fn queue(&mut self, number: u64) -> Result<()> {
         stamp(&mut self.bytes, number);
         let length = u32::try_from(self.bytes.len())?.to_be_bytes();
@@ -155,7 +156,7 @@ impl BareEnd {
             self.unsent.extend_from_slice(&self.bytes);
             return self.flush();
         }
-        // Nothing is gained by a copy of this one.
+        // A copy of this message into the queue would gain nothing.
         self.flush()?;
         Ok(self.runtime.block_on(self.out.write_all(&self.bytes))?)
     }
@@ -167,7 +168,7 @@ impl BareEnd {
     }
 }
 
-/// A stream that nothing was written to nobody hears of.
+/// Writes one byte, because the peer learns of a stream only when data arrives on it.
 async fn greet(mut out: SendStream) -> Result<SendStream> {
     out.write_all(&[0]).await?;
     Ok(out)
@@ -175,7 +176,7 @@ async fn greet(mut out: SendStream) -> Result<SendStream> {
 
 fn endpoint(config: Option<ServerConfig>) -> Result<Endpoint> {
     let socket = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0))?;
-    // As a daemon's. With the system's own a stream on loopback loses packets.
+    // These are a daemon's sizes. With the system's defaults a stream on loopback loses packets.
     sockopt::set_socket_recv_buffer_size(&socket, SOCKET_BUFFER)?;
     sockopt::set_socket_send_buffer_size(&socket, SOCKET_BUFFER)?;
     Ok(Endpoint::new(EndpointConfig::default(), config, socket, Arc::new(TokioRuntime))?)
@@ -195,7 +196,7 @@ impl End for BareEnd {
         self.queue(number)?;
         self.flush()?;
         if self.is_paced {
-            // Each lets quinn's tasks run once: the first sends, the second takes in acknowledgements.
+            // Each yield lets quinn's tasks run once. The first sends, and the second processes acknowledgements.
             self.runtime.block_on(async {
                 tokio::task::yield_now().await;
                 tokio::task::yield_now().await;
@@ -216,7 +217,8 @@ impl End for BareEnd {
     }
 
     fn idle(&mut self, channel: &Channel) -> Result<()> {
-        // Not in the reactor: this is between turns, and the channel is one that blocks.
+        // This polls instead of registering the channel with the reactor: it happens between turns, and the channel is
+        // a blocking socket.
         self.runtime.block_on(async {
             while !channel.is_readable()? {
                 tokio::time::sleep(CHECK_INTERVAL).await;
@@ -233,7 +235,7 @@ impl Drop for BareEnd {
     }
 }
 
-/// What was read from the stream and not taken yet: the buffer's bytes from `taken` to `filled`.
+/// Bytes that were read from the stream and not yet taken: those of `buffer` from `taken` to `filled`.
 struct Unread {
     buffer: Vec<u8>,
     taken: usize,
@@ -241,7 +243,7 @@ struct Unread {
 }
 
 impl Unread {
-    /// Fills `into` with what comes next. Waits only where that is not here.
+    /// Fills `into` with the next bytes. Waits only for bytes that are not in the buffer.
     fn take(&mut self, runtime: &Runtime, stream: &mut RecvStream, into: &mut [u8]) -> Result<()> {
         let mut done = 0;
         loop {

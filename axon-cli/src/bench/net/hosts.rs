@@ -1,4 +1,4 @@
-//! Two hosts of the measurement's own, on this machine's loopback.
+//! Starts two hosts for the measurement, on this machine's loopback.
 
 use std::path::Path;
 
@@ -20,12 +20,12 @@ use crate::{
 pub(super) struct Hosts<'a> {
     runtime: &'a Runtime,
     daemons: Option<[Host; 2]>,
-    /// Of the processes on each.
+    /// The settings of the processes on each host.
     pub(super) settings: [Settings; 2],
 }
 
 impl<'a> Hosts<'a> {
-    /// Starts them; `dir` takes what they keep.
+    /// Starts the daemons. `dir` holds their files.
     pub(super) fn start(runtime: &'a Runtime, mode: Mode, kmes: &Kmes, dir: &Path) -> Result<Self> {
         let spec = |name, stem, [address, peer]: [&'static str; 2], role, peers| HostSpec {
             name,
@@ -54,7 +54,7 @@ impl<'a> Hosts<'a> {
         Ok(Self { runtime, daemons: Some(daemons), settings })
     }
 
-    /// The process ids of the daemons.
+    /// Returns the process ids of the daemons.
     pub(super) fn pids(&self) -> Result<[u32; 2]> {
         let [near, far] = &self.settings;
         Ok([daemon_pid(near)?, daemon_pid(far)?])

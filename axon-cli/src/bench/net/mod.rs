@@ -1,4 +1,4 @@
-//! `axon bench net`: what crosses between two hosts, beside a stream of bare quinn.
+//! `axon bench net`: compares AXON between two hosts with a stream of bare quinn.
 
 mod bare;
 mod hosts;
@@ -30,37 +30,37 @@ use crate::{
 
 const SIZES: [usize; 6] = [64, 1 << 10, 4 << 10, 64 << 10, 1 << 20, 4 << 20];
 const QUICK_SIZES: [usize; 2] = [64, 64 << 10];
-/// Messages that have a pace are no longer than this, so that one packet holds them: bare quinn has no thread that would
-/// take in the acknowledgements for which the rest of a longer one waits.
+/// The longest message with a pace. One packet holds it. Bare quinn has no thread that would process the
+/// acknowledgements for which the rest of a longer message waits.
 const MAX_PACED: usize = 1 << 10;
 
 const ANSWERING: &str = "bench-net-answer";
 const READING: &str = "bench-net-read";
 
-/// A message there and one back, by turns; times are one way, half a round trip.
+/// Round trips by turns. Times are one way, which is half a round trip.
 struct Latency {
     size: usize,
     bare: Rounds,
     axon: Rounds,
 }
 
-/// A message whenever one is due; times are from just before it is sent to when it was taken.
+/// Messages with a pace. Times are from just before a message is sent until it was taken.
 struct Paced {
     load: Load,
-    /// From one process to another in shared memory: one wake-up.
+    /// The time of one wake-up, from one process to another in shared memory.
     wake_up: Rounds,
     bare: Rounds,
     axon: Rounds,
 }
 
 impl Paced {
-    /// The most that AXON may take: bare quinn's time, and a wake-up of each daemon.
+    /// Returns the longest permitted time of AXON: bare quinn's time, and one wake-up for each daemon.
     fn allowed(&self) -> f64 {
         self.bare.typical() + 2.0 * self.wake_up.typical()
     }
 }
 
-/// Streams of one size, by turns; of each the best turn.
+/// Streams of one size, by turns. Each field is the best turn.
 struct Streams {
     size: usize,
     bare: Streamed,
@@ -71,7 +71,7 @@ struct Streams {
 struct Measured {
     mode: Mode,
     latency: Vec<Latency>,
-    /// By pace, then by size.
+    /// Sorted by pace, then by size.
     paced: Vec<Paced>,
     streams: Vec<Streams>,
 }
@@ -101,17 +101,17 @@ pub(crate) fn run(args: &cli::BenchNet) -> Result<(), CliError> {
     Ok(())
 }
 
-/// Is the process that answers.
+/// Runs as the process that answers.
 pub(crate) fn answer() -> Result<(), CliError> {
     harness::serve(&media(&Sessions(None))).map_err(CliError::failed)
 }
 
-/// Is the process that reads streams.
+/// Runs as the process that reads streams.
 pub(crate) fn read() -> Result<(), CliError> {
     stream::attend().map_err(CliError::failed)
 }
 
-/// The raw limits first. The wake-up alone is for messages that have a pace.
+/// Returns the media, with the raw limits first. The wake-up limit is used only for messages that have a pace.
 fn media(sessions: &Sessions) -> [&dyn Medium; 3] {
     [&Raw(Sleeps::Epoll), &BareQuic, sessions]
 }

@@ -1,4 +1,4 @@
-//! The results as text, and as JSON.
+//! Formats the results as text and as JSON.
 
 use std::fmt::Write as _;
 
@@ -13,7 +13,7 @@ use crate::{
     text::{self, TextTable},
 };
 
-/// How figures are taken; in every output.
+/// Explains in every output how figures are obtained.
 const REPORTED: &str = "AXON between two hosts on one machine's loopback, and one stream of bare \
                         quinn, take turns. Latency is one way (half a round trip), of the round \
                         with the least median; of streams the best of the turns counts. Messages at a \
@@ -88,12 +88,12 @@ fn paced(measured: &Measured) -> String {
     table.render(0)
 }
 
-/// KEEP_ALL by bare quinn: messages a second.
+/// Returns the rate of messages with KEEP_ALL, divided by that of bare quinn.
 fn goodput(row: &Streams) -> f64 {
     row.waits.per_second() / row.bare.per_second()
 }
 
-/// The same: processor time of a message.
+/// Returns the processor time of a message with KEEP_ALL, divided by that of bare quinn.
 fn cpu_by_bare(row: &Streams) -> f64 {
     row.waits.cpu_us_a_message() / row.bare.cpu_us_a_message().max(1e-9)
 }

@@ -1,4 +1,4 @@
-//! Streams: as fast as the publisher can, to a reader in another process.
+//! Measures streams: a publisher at full speed, and a reader in another process.
 
 use std::time::{Duration, Instant};
 
@@ -21,24 +21,25 @@ use crate::bench::{
 /// The number of a stream's last message.
 const LAST: u64 = u64::MAX;
 
-/// What the publisher does when it is too fast.
+/// The behaviour of a publisher that is faster than its reader.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub(super) enum Flow {
-    /// It waits: RELIABLE and KEEP_ALL.
+    /// The publisher waits: RELIABLE and KEEP_ALL.
     Waits,
-    /// It does not, and the oldest are lost: RELIABLE and KEEP_LAST(10), ROS 2's default.
+    /// The publisher does not wait, and the oldest messages are lost: RELIABLE and KEEP_LAST(10),
+    /// the default of ROS 2.
     Overtakes,
 }
 
-/// What became of a stream.
+/// The result of a stream.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub(super) struct Streamed {
     pub(super) sent: u64,
     pub(super) taken: u64,
-    /// From the first message taken to the last.
+    /// The seconds from the first message taken to the last.
     pub(super) seconds: f64,
-    /// Processor time of all processes that took part.
+    /// The processor time in seconds of all processes that took part.
     pub(super) cpu_seconds: f64,
 }
 
@@ -58,7 +59,7 @@ enum StreamCommand {
     Read { settings: Settings, topic: String, flow: Flow },
 }
 
-/// What the reader found: messages, seconds, processor time.
+/// The reader's result: messages, seconds, and seconds of processor time.
 type Found = (u64, f64, f64);
 
 /// The process that reads.
@@ -69,7 +70,7 @@ impl Reader {
         Ok(Self(spawn(arguments)?))
     }
 
-    /// Over bare quinn.
+    /// Measures a stream over bare quinn.
     pub(super) fn bare(&self, size: usize, threads: Threads, length: Duration) -> Result<Streamed> {
         let channel = self.0.channel();
         channel.tell(&StreamCommand::Bare { size, threads })?;
@@ -84,7 +85,7 @@ impl Reader {
         self.found(sent, || cpu::own() - before)
     }
 
-    /// From a publisher on the first host to a subscription on the other.
+    /// Measures a stream from a publisher on the first host to a subscription on the other.
     pub(super) fn axon(
         &self,
         hosts: &Hosts<'_>,
@@ -111,7 +112,7 @@ impl Reader {
             loop {
                 match publisher.publish(&bytes) {
                     Ok(_) => return Ok(()),
-                    // The reader is slow: this is what KEEP_ALL means.
+                    // The reader is slower, so a KEEP_ALL publisher waits.
                     Err(PublishError::Blocked { .. }) => {}
                     Err(error) => return Err(error.into()),
                 }
@@ -126,7 +127,7 @@ impl Reader {
     }
 }
 
-/// Is the process that reads, until the one that measures ends.
+/// Runs as the process that reads, until the process that measures ends.
 pub(super) fn attend() -> Result<()> {
     set_parent_process_death_signal(Some(Signal::KILL))?;
     let channel = Channel::inherited()?;
@@ -163,7 +164,7 @@ fn read(channel: &Channel, settings: &Settings, topic: &str, flow: Flow) -> Resu
     })
 }
 
-/// Receives until the last message, in order.
+/// Receives messages until the last one, and checks their order.
 fn count(mut receive: impl FnMut() -> Result<u64>) -> Result<Found> {
     let mut before = receive()?;
     let (start, cpu) = (Instant::now(), cpu::own());
@@ -179,7 +180,7 @@ fn count(mut receive: impl FnMut() -> Result<u64>) -> Result<Found> {
     Ok((taken, start.elapsed().as_secs_f64(), cpu::own() - cpu))
 }
 
-/// Sends for this long, then the last message; how many in all.
+/// Sends for `length`, then sends the last message. Returns the number of messages sent.
 fn until_over(length: Duration, mut send: impl FnMut(u64) -> Result<()>) -> Result<u64> {
     let start = Instant::now();
     let mut sent = 0;

@@ -1,4 +1,4 @@
-//! A reader's process.
+//! A reader process.
 
 use std::{
     sync::atomic::{AtomicU32, Ordering},
@@ -18,21 +18,21 @@ use super::{
     place::ReadersMemory,
 };
 
-/// A wait ends with the message that it is for.
+/// The longest sleep. A message ends it earlier.
 const LONGEST_SLEEP: Option<Duration> = Some(Duration::from_secs(1));
 
-/// What the process that measures has a reader do.
+/// A command of the process that measures.
 #[derive(Serialize, Deserialize)]
 pub(super) enum ReaderCommand {
-    /// Map the memory that comes with it; its number among the readers.
+    /// Map the memory that comes with the command. `index` is the reader's number.
     Share {
         size: usize,
         index: usize,
     },
-    /// Subscribe over the socket that comes with it.
+    /// Subscribe over the socket that comes with the command.
     Connect,
-    /// Read so many messages: of a subscriber by its number, or of the raw limit. Those of all media
-    /// together have numbers; the first one follows `after`. Answered by the processor time that it took,
+    /// Read `messages` messages from a subscriber, given by its number, or from the raw limit. The messages of all
+    /// media are numbered together, and the first one follows `after`. The answer is the processor time that it took,
     /// in seconds.
     Attend {
         source: Option<usize>,
@@ -43,7 +43,7 @@ pub(super) enum ReaderCommand {
     Drop,
 }
 
-/// Is one of the readers, until the process that measures ends.
+/// Runs as one of the readers, until the process that measures ends.
 pub(in crate::bench) fn attend() -> Result<()> {
     set_parent_process_death_signal(Some(Signal::KILL))?;
     let channel = Channel::inherited()?;
@@ -85,7 +85,7 @@ pub(in crate::bench) fn attend() -> Result<()> {
                         return Err(format!("message {number} came after message {past}").into());
                     }
                     place.read_at(*index).store(now_ns(), Ordering::Relaxed);
-                    // Pairs with the load of the publisher.
+                    // Pairs with the publisher's Acquire load in `Turns::take`.
                     place.read_by(*index).store(past + 1, Ordering::Release);
                 }
                 channel.tell(&(cpu::own() - before))?;
@@ -100,7 +100,7 @@ pub(in crate::bench) fn attend() -> Result<()> {
     Ok(())
 }
 
-/// Sleeps while the futex has a number up to `past`.
+/// Sleeps while the futex holds a number up to `past`.
 fn sleep_past(word: &AtomicU32, past: u32) -> Result<()> {
     loop {
         let now = word.load(Ordering::Acquire);

@@ -1,4 +1,4 @@
-//! What a publish costs with 1 to 16 reader processes that read every byte.
+//! Measures a publish to 1, 4 and 16 reader processes that read every byte.
 
 mod attend;
 mod place;
@@ -22,20 +22,20 @@ use super::harness::{
     Channel, Effort, Machine, Other, Result, Rounds, cpu, now_ns, qos, spawn, stamp,
 };
 
-/// How many readers are compared.
+/// The numbers of readers that are compared.
 pub(super) const READERS: [usize; 3] = [1, 4, READERS_AT_MOST];
-/// Between the moment at which all have read a message and the next one: longer than anybody looks before
-/// it sleeps.
+/// The pause between the time when all have read a message and the next message. It is longer than any reader polls
+/// before it sleeps.
 const MESSAGE_INTERVAL: Duration = Duration::from_micros(200);
-/// Between two looks at whether all have read.
+/// The time between two checks whether all have read.
 const NAP: Duration = Duration::from_micros(100);
 
-/// What readers do until there is a message.
+/// How readers wait for a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Until {
-    /// They sleep where the publisher does not have to wake them, and are woken when its time is taken.
+    /// Readers sleep on a futex that is not the publisher's. They are woken after the time of the call was taken.
     Told,
-    /// They sleep, and the publisher wakes them.
+    /// Readers sleep, and the publisher wakes them.
     Woken,
 }
 
@@ -43,33 +43,33 @@ impl Until {
     pub(super) const ALL: [Self; 2] = [Self::Told, Self::Woken];
 }
 
-/// What publishes of one medium took.
+/// The times of the publishes of one medium.
 #[derive(Default)]
 pub(super) struct Published {
-    /// The call alone. Its processor time is that of all processes.
+    /// The call alone. The processor time is that of all processes.
     pub(super) call: Rounds,
-    /// From its beginning until the last reader had copied every byte out.
+    /// The time from the start of the call until the last reader had copied every byte out.
     pub(super) read: Rounds,
 }
 
-/// Publishes of one size to so many readers.
+/// Publishes of one size to one number of readers.
 pub(super) struct Cost {
     pub(super) size: usize,
     pub(super) readers: usize,
     pub(super) until: Until,
-    /// A plain copy, a store, and where readers are woken one `FUTEX_WAKE` for all.
+    /// The raw limit: a plain copy, a store, and one `FUTEX_WAKE` for all readers if they have to be woken.
     pub(super) raw: Published,
     pub(super) axon: Published,
 }
 
-/// As many processes as the most readers.
+/// The reader processes, as many as the largest comparison needs.
 pub(super) struct ReaderProcesses<'a> {
     readers: Vec<Other>,
     machine: &'a Machine,
 }
 
 impl<'a> ReaderProcesses<'a> {
-    /// Starts them on every CPU but that of the process that measures, and leaves this thread on it.
+    /// Starts the processes on all CPUs except that of the process that measures, and pins this thread to that CPU.
     pub(super) fn start(machine: &'a Machine, arguments: &[&str]) -> Result<Self> {
         machine.beside()?;
         let readers = (0..READERS_AT_MOST).map(|_| spawn(arguments)).collect::<Result<_>>()?;
@@ -77,7 +77,7 @@ impl<'a> ReaderProcesses<'a> {
         Ok(Self { readers, machine })
     }
 
-    /// Measures publishes of `size` bytes: for each of [`READERS`] told and woken, raw and AXON in turns.
+    /// Measures publishes of `size` bytes, for each number of [`READERS`] and each [`Until`]. Raw and AXON take turns.
     pub(super) fn measure(&self, size: usize, effort: Effort) -> Result<Vec<Cost>> {
         let (place, fd) = ReadersMemory::create(size)?;
         for (index, reader) in self.readers.iter().enumerate() {
@@ -106,7 +106,7 @@ impl<'a> ReaderProcesses<'a> {
             };
             costs.extend(READERS.map(new));
         }
-        // The first round warms up.
+        // The first round warms up and does not count.
         for round in 0..=effort.paced_rounds {
             for cost in &mut costs {
                 let Cost { readers, until, raw, axon, .. } = cost;
@@ -131,11 +131,11 @@ impl<'a> ReaderProcesses<'a> {
     }
 }
 
-/// What one turn of one medium took.
+/// The times of one turn of one medium.
 struct Turn {
-    /// Nanoseconds of each call, and until all had read.
+    /// Nanoseconds of each call, and nanoseconds until all had read.
     times: [Vec<f64>; 2],
-    /// Nanoseconds of processor time a message.
+    /// Nanoseconds of processor time per message.
     cpu: f64,
 }
 
@@ -143,12 +143,12 @@ struct Turns<'a> {
     processes: &'a ReaderProcesses<'a>,
     place: ReadersMemory,
     bytes: Vec<u8>,
-    /// By all media together.
+    /// The number of messages published by all media together.
     published: u32,
 }
 
 impl Turns<'_> {
-    /// A turn of AXON's publisher with that number, or of the raw limit.
+    /// Takes a turn of the publisher in `source`, or of the raw limit.
     fn take(
         &mut self,
         source: Option<(usize, &Publisher)>,
@@ -158,7 +158,7 @@ impl Turns<'_> {
     ) -> Result<Turn> {
         let readers = &self.processes.readers[..readers];
         for (index, reader) in readers.iter().enumerate() {
-            // A reader subscribes to those publishers only that have so many.
+            // A reader subscribes only to the publishers that have enough readers to include it.
             let absent = READERS.iter().filter(|count| **count <= index).count();
             reader.channel().tell(&ReaderCommand::Attend {
                 source: source.map(|(at, _)| at - absent),

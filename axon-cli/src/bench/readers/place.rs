@@ -1,4 +1,4 @@
-//! The memory that a publish by the raw limit and its readers share.
+//! The memory that the raw limit of a publish shares with its readers.
 
 use std::{
     os::fd::OwnedFd,
@@ -7,9 +7,10 @@ use std::{
 
 use super::super::harness::{Result, SharedPages};
 
-/// Readers of which each has words of its own.
+/// The number of readers that have their own words.
 pub(super) const READERS_AT_MOST: usize = 16;
-/// Bytes between two words that must not share a line, or two lines that are fetched together.
+/// The distance in bytes between two words that must share neither a cache line nor a pair of lines
+/// that are fetched together.
 const APART: usize = 256;
 const MESSAGE: usize = 0;
 const TOLD: usize = APART;
@@ -19,7 +20,8 @@ const PAYLOAD: usize = 8192;
 pub(super) struct ReadersMemory(SharedPages);
 
 impl ReadersMemory {
-    /// New, for messages of `size` bytes, and the descriptor by which readers map it.
+    /// Creates memory for messages of `size` bytes. Returns it with the descriptor by which readers
+    /// map it.
     pub(super) fn create(size: usize) -> Result<(Self, OwnedFd)> {
         let (memory, fd) = SharedPages::create(PAYLOAD + size)?;
         Ok((Self(memory), fd))
@@ -29,22 +31,22 @@ impl ReadersMemory {
         Ok(Self(SharedPages::map(fd, PAYLOAD + size)?))
     }
 
-    /// The number of the raw limit's last message, a futex.
+    /// Returns the futex with the number of the raw limit's last message.
     pub(super) fn message(&self) -> &AtomicU32 {
         self.0.half(MESSAGE)
     }
 
-    /// The number of the last message of which readers were told, a futex.
+    /// Returns the futex with the number of the last message that was announced to readers.
     pub(super) fn told(&self) -> &AtomicU32 {
         self.0.half(TOLD)
     }
 
-    /// The number of the last message that this reader has copied out.
+    /// Returns the word with the number of the last message that this reader has copied out.
     pub(super) fn read_by(&self, reader: usize) -> &AtomicU32 {
         self.0.half(READ + reader * APART)
     }
 
-    /// When that was.
+    /// Returns the word with the time at which this reader copied the last message out.
     pub(super) fn read_at(&self, reader: usize) -> &AtomicU64 {
         self.0.word(READ + reader * APART + 8)
     }

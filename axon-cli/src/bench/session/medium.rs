@@ -1,4 +1,4 @@
-//! Sessions, as their documentation says to use them.
+//! Measures sessions, used as their documentation recommends.
 
 use std::{
     sync::atomic::{AtomicU32, Ordering},
@@ -14,27 +14,27 @@ use crate::bench::harness::{
     Channel, End, Error, Load, Medium, Motion, Result, Side, agree, qos, stamp,
 };
 
-/// A wait ends with what it is for.
+/// The longest sleep. A message ends it earlier.
 const LONGEST_SLEEP: Option<Duration> = Some(Duration::from_secs(1));
-/// Up to here a sample is copied in any case.
+/// A sample of up to this size is copied in any case.
 const COPIED: usize = 4096;
-/// Up to here so is what is loaned.
+/// A loan of up to this size is copied as well.
 const LOANS_COPIED: usize = 512;
 
-/// The number of an end, for topics that no other has.
+/// The number of the next end, which makes its topics unique.
 static NUMBER: AtomicU32 = AtomicU32::new(0);
 
-/// The hosts of the process that measures and of the other one, which may be the same; the other
-/// process is told.
+/// The settings of the hosts of the process that measures and of the other process. Both may be the
+/// same host. Only the process that measures has them, and it sends the other process its own.
 pub(in crate::bench) type Hosts = Option<[Settings; 2]>;
 
 /// A publisher and a subscription in each of two sessions.
 pub(in crate::bench) struct Sessions(pub(in crate::bench) Hosts);
 
-/// A service: a request there, and its response back, both copied in and out.
+/// A service: a request there and its response back. Both are copied in and out.
 pub(super) struct Service(pub(super) Hosts);
 
-/// The session of this end, and the name of what it shares with the other.
+/// Opens the session of this end. Returns it with the name that both ends share.
 fn meet(hosts: &Hosts, side: Side, channel: &Channel) -> Result<(Session, String)> {
     let (settings, name) = match side {
         Side::Near => {
@@ -48,7 +48,7 @@ fn meet(hosts: &Hosts, side: Side, channel: &Channel) -> Result<(Session, String
     Ok((session(&settings)?, name))
 }
 
-/// The daemons of both hosts, or the one of both.
+/// Returns the process ids of the daemons of both hosts, without duplicates.
 fn daemons(hosts: &Hosts) -> Result<Vec<u32>> {
     let mut pids = Vec::new();
     for settings in hosts.iter().flatten() {
@@ -208,7 +208,7 @@ struct Answering {
     session: Session,
     sleeps: bool,
     bytes: Vec<u8>,
-    /// Who asked last, and what number the request has.
+    /// The client of the last request, and the request's number.
     asked: Option<(Gid, u64)>,
 }
 

@@ -1,4 +1,4 @@
-//! `axon bench session`: what a session adds to the shared memory under it.
+//! `axon bench session`: measures what a session adds to the shared memory under it.
 
 pub(super) mod medium;
 pub(super) mod place;
@@ -27,16 +27,16 @@ const KINDS: [(Wake, Motion); 4] = [
     (Wake::Event, Motion::Copy),
     (Wake::Event, Motion::Touch),
 ];
-/// What a session may take at most, by what bare shared memory takes.
+/// The most time that a session may take, divided by that of bare shared memory.
 const BUDGET: f64 = 1.3;
-/// What a request and its response may take at most, by what one message takes one way that is copied
-/// as they are.
+/// The most time that a request and its response may take, divided by the time of a session's message one way. Both are
+/// copied in and out.
 const SERVICE_BUDGET: f64 = 2.5;
 
 const ANSWERING: &str = "bench-session-answer";
 
-/// A load, and what each of those made of it that carry it: times are one way, half a round trip, or
-/// from message to message.
+/// The times of each medium that carries a load. They are one way, which is half a round trip, or from message to
+/// message.
 struct Compared {
     load: Load,
     bare: Rounds,
@@ -66,12 +66,12 @@ pub(crate) fn run(args: &cli::BenchSession) -> Result<(), CliError> {
     Ok(())
 }
 
-/// Is the process that answers.
+/// Runs as the process that answers.
 pub(crate) fn answer() -> Result<(), CliError> {
     harness::serve(&media(&Sessions(None), &Service(None))).map_err(CliError::failed)
 }
 
-/// Bare shared memory first.
+/// Returns the media, with bare shared memory first.
 fn media<'a>(sessions: &'a Sessions, service: &'a Service) -> [&'a dyn Medium; 3] {
     [&Axon, sessions, service]
 }

@@ -1,4 +1,4 @@
-//! A daemon of the measurement's own, and sessions with it.
+//! Starts a daemon for the measurement, and opens sessions with it.
 
 use std::{
     env,
@@ -16,13 +16,13 @@ use serde_json::Value;
 
 use crate::bench::harness::Result;
 
-/// Longer than any machine needs to start a daemon or to match two endpoints.
+/// Any machine starts a daemon, and matches two endpoints, within this time.
 pub(in crate::bench) const MATCH_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// What a host's processes have in their environment.
+/// The environment variables of a host's processes.
 pub(in crate::bench) type Settings = Vec<(String, String)>;
 
-/// A host of the measurement's own: nobody else's daemon takes part.
+/// A host for the measurement alone; no other daemon takes part.
 pub(super) struct BenchHost {
     _dir: tempfile::TempDir,
     settings: Settings,
@@ -59,7 +59,7 @@ impl BenchHost {
         Ok(place)
     }
 
-    /// What another process needs to know to come here, too.
+    /// Returns the settings with which another process joins this host.
     pub(super) fn settings(&self) -> Settings {
         self.settings.clone()
     }
@@ -72,18 +72,18 @@ impl Drop for BenchHost {
     }
 }
 
-/// A session with the daemon that has these settings.
+/// Opens a session with the daemon that has these settings.
 pub(in crate::bench) fn session(settings: &Settings) -> Result<Session> {
     Ok(Session::open(&config(settings)?, SessionOptions::new("bench"))?)
 }
 
-/// The process id of the daemon that has these settings.
+/// Returns the process id of the daemon that has these settings.
 pub(in crate::bench) fn daemon_pid(settings: &Settings) -> Result<u32> {
     let status: Value = serde_json::from_str(&daemon_status(&config(settings)?)?)?;
     Ok(u32::try_from(status["pid"].as_u64().ok_or("a status without a pid")?)?)
 }
 
-/// With them a session finds its daemon.
+/// Returns a configuration with which a session finds the daemon.
 pub(in crate::bench) fn config(settings: &Settings) -> Result<Config> {
     let env = settings.iter().map(|(name, value)| (OsString::from(name), OsString::from(value)));
     let mut config = Config::resolve(env, None, &OsFiles)?;

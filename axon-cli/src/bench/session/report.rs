@@ -1,4 +1,4 @@
-//! The results as text, and as JSON.
+//! Formats the results as text and as JSON.
 
 use std::fmt::Write as _;
 
@@ -13,7 +13,7 @@ use crate::{
     text::{self, TextTable},
 };
 
-/// How figures are taken from rounds; in every output.
+/// Explains in every output how figures are obtained from rounds.
 const REPORTED: &str = "Bare shared memory, sessions and a service take turns. Times are p50 of the \
                         round in which it was least: one way (half a round trip), and for the \
                         service both ways. Ratios are of those p50. A service copies requests and \
@@ -21,17 +21,17 @@ const REPORTED: &str = "Bare shared memory, sessions and a service take turns. T
                         stream as much is under way as 16 MiB hold, from 4 to 64 messages. CPU is \
                         the processor time of a message in both processes and their daemon.";
 
-/// A ratio, and what it may be.
+/// A ratio and its budget.
 type Judged = (f64, f64);
-/// Makes a table of those.
+/// Formats rows as a table.
 type Tabulate = fn(Vec<&Compared>) -> String;
 
-/// A session by bare shared memory.
+/// Returns the ratio of a session's time to that of bare shared memory.
 fn session_to_bare(row: &Compared) -> Judged {
     (row.session.to(&row.bare).best, BUDGET)
 }
 
-/// A service's round trip by a session's message.
+/// Returns the ratio of a service's round trip to a session's message one way.
 fn service_to_session(row: &Compared, service: &Rounds) -> Judged {
     (2.0 * service.to(&row.session).best, SERVICE_BUDGET)
 }

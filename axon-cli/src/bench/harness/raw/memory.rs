@@ -1,4 +1,4 @@
-//! Memory that two processes share, as bare as it gets.
+//! Memory that two processes share, without any protocol.
 #![allow(unsafe_code)]
 
 use std::{
@@ -15,49 +15,53 @@ use rustix::{
 
 use super::super::Result;
 
-/// A map that both processes may write.
+/// A mapping that both processes may write.
 ///
-/// Words are atomic. Bytes are plain: who copies them has to know from a word that the other
-/// process does not touch them meanwhile.
+/// Words are atomic. Bytes are not: before a process copies bytes, a word must have told it that
+/// the other process does not access them at the same time.
 pub(crate) struct SharedPages {
     base: NonNull<c_void>,
     len: usize,
 }
 
 impl SharedPages {
-    /// New memory of `len` bytes, and the descriptor by which the other process maps it.
+    /// Creates memory of `len` bytes. Returns it with the descriptor by which the other process
+    /// maps it.
     pub(crate) fn create(len: usize) -> Result<(Self, OwnedFd)> {
         let fd = memfd_create("bench-raw", MemfdFlags::CLOEXEC)?;
         ftruncate(&fd, len as u64)?;
         Ok((Self::map(&fd, len)?, fd))
     }
 
-    /// Maps what the other process made.
+    /// Maps memory that the other process created.
     pub(crate) fn map(fd: impl AsFd, len: usize) -> Result<Self> {
         let access = ProtFlags::READ | ProtFlags::WRITE;
-        // SAFETY: a fresh mapping at an address of the kernel's choice aliases nothing.
+        // SAFETY: a new mapping at an address that the kernel chooses aliases nothing.
         let base = unsafe { mmap(ptr::null_mut(), len, access, MapFlags::SHARED, fd, 0) }?;
         Ok(Self { base: NonNull::new(base).ok_or("memory was mapped at address zero")?, len })
     }
 
-    /// The word at byte `at`, a multiple of eight.
+    /// Returns the word at byte `at`, which must be a multiple of eight.
     #[inline]
     pub(crate) fn word(&self, at: usize) -> &AtomicU64 {
         assert!(at.is_multiple_of(8) && at + 8 <= self.len);
-        // SAFETY: inside the mapping, which starts at a page, and aligned, as was just checked.
+        // SAFETY: the word is inside the mapping, which starts at a page boundary, and it is
+        // aligned; both were checked above.
         let word = unsafe { self.base.cast::<u8>().add(at) }.cast::<AtomicU64>();
-        // SAFETY: it lives as long as the mapping, every bit pattern is a valid word, and that the
-        // other process writes it too is what an atomic word is for.
+        // SAFETY: the word lives as long as the mapping, every bit pattern is a valid word, and an
+        // atomic word may be written by the other process as well.
         unsafe { word.as_ref() }
     }
 
-    /// The four bytes at byte `at`, a multiple of four: what a futex can be.
+    /// Returns the four bytes at byte `at`, which must be a multiple of four. A futex needs four
+    /// bytes.
     #[inline]
     pub(crate) fn half(&self, at: usize) -> &AtomicU32 {
         assert!(at.is_multiple_of(4) && at + 4 <= self.len);
-        // SAFETY: inside the mapping, which starts at a page, and aligned, as was just checked.
+        // SAFETY: the word is inside the mapping, which starts at a page boundary, and it is
+        // aligned; both were checked above.
         let word = unsafe { self.base.cast::<u8>().add(at) }.cast::<AtomicU32>();
-        // SAFETY: as in `word`.
+        // SAFETY: the reasons are those in `word`.
         unsafe { word.as_ref() }
     }
 
@@ -65,7 +69,8 @@ impl SharedPages {
     #[inline]
     pub(crate) fn copy_in(&self, at: usize, bytes: &[u8]) {
         let to = self.bytes(at, bytes.len());
-        // SAFETY: as many bytes of the mapping, which no reference points to, so nothing overlaps.
+        // SAFETY: the mapping has this many bytes at `to`. No reference points to them, so nothing
+        // overlaps.
         unsafe { to.copy_from_nonoverlapping(NonNull::from(bytes).cast(), bytes.len()) };
     }
 
@@ -73,13 +78,13 @@ impl SharedPages {
     #[inline]
     pub(crate) fn copy_out(&self, at: usize, bytes: &mut [u8]) {
         let from = self.bytes(at, bytes.len());
-        // SAFETY: as in `copy_in`, the other way round.
+        // SAFETY: the reasons are those in `copy_in`, with source and destination exchanged.
         unsafe { from.copy_to_nonoverlapping(NonNull::from(&mut *bytes).cast(), bytes.len()) };
     }
 
     fn bytes(&self, at: usize, len: usize) -> NonNull<u8> {
         assert!(at.checked_add(len).is_some_and(|end| end <= self.len));
-        // SAFETY: inside the mapping, as was just checked.
+        // SAFETY: the address is inside the mapping, as was checked above.
         unsafe { self.base.cast::<u8>().add(at) }
     }
 }

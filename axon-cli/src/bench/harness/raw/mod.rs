@@ -1,4 +1,4 @@
-//! The limits: what the machine gives two processes without any middleware.
+//! The raw limits: the fastest communication between two processes without any middleware.
 
 mod memory;
 mod sleep;
@@ -14,22 +14,23 @@ use sleep::{Asleep, Bell, sleep, wake};
 
 use super::{Channel, End, Load, Medium, Motion, Result, Side, Wake, agree, stamp};
 
-/// A message of up to this many bytes has room beside the word that announces it, so that its
-/// limit is the word alone.
+/// A message of up to this many bytes fits beside the word that announces it, so its limit is the word alone.
 const INLINE: usize = 88;
-/// Bytes between two things that must not share a cache line, or two that are fetched together.
+/// The distance in bytes between two objects that must share neither a cache line nor a pair of lines that are fetched
+/// together.
 const APART: usize = 256;
 const PAYLOADS: usize = 4096;
 
-/// From a direction's word to the word that says whether its receiver sleeps, on another line.
+/// The distance from a direction's word to the word that tells whether its receiver sleeps. It puts them on different
+/// cache lines.
 const ASLEEP: usize = 128;
 
-/// A shared atomic that is spun on, or slept for in one of three ways; with as many plain copies as the
-/// load has. Messages of up to 88 bytes are not copied.
+/// A shared atomic that the receiver polls, or for which it sleeps in one of three ways. The bytes are copied as often
+/// as the load requires. Messages of up to 88 bytes are not copied.
 ///
-/// Where the receiver polls there is one for all, [`Sleeps::Epoll`]. Where messages follow each other at
-/// once AXON looks before it sleeps, so the limit that does so, too, is [`Sleeps::SpinEpoll`]; the other two
-/// are for messages that have a pace, and for two processes on one CPU, where looking is of no use.
+/// Under a load with a polling receiver, one limit serves, [`Sleeps::Epoll`]. Where messages follow each other at once,
+/// AXON polls before it sleeps; the limit that does the same is [`Sleeps::SpinEpoll`]. The other two are for messages
+/// with a pace. [`Sleeps::Epoll`] is also for two processes on one CPU, where polling is of no use.
 pub(crate) struct Raw(pub(crate) Sleeps);
 
 impl Medium for Raw {
@@ -94,24 +95,24 @@ struct RawEnd {
     memory: SharedPages,
     load: Load,
     slot: usize,
-    /// With one for all, a sender has to take each line back from the receiver's cache: up to 40 %
-    /// slower. With many, large messages are in no cache.
+    /// The number of slots. With one slot, a sender has to take each line back from the receiver's cache, which is up
+    /// to 40 % slower. With many slots, large messages are in no cache.
     slots: u64,
     out: Direction,
     into: Direction,
     how: Option<Sleeps>,
-    /// Wakes the other side.
+    /// The eventfd that wakes the other side.
     bell: OwnedFd,
     ours: Bell,
     bytes: Vec<u8>,
 }
 
 struct Direction {
-    /// Where the number of the last message is.
+    /// The offset of the word that holds the number of the last message.
     word: usize,
-    /// Where the messages are, one to a slot.
+    /// The offset of the messages, one in each slot.
     payload: usize,
-    /// How many there have been.
+    /// The number of messages so far.
     count: u64,
 }
 

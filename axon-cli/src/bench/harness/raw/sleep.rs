@@ -1,4 +1,4 @@
-//! How a receiver sleeps until there is something, and how the sender wakes it.
+//! How a receiver sleeps until a message arrives, and how the sender wakes it.
 
 use std::{
     hint::spin_loop,
@@ -16,19 +16,20 @@ use rustix::{
 
 use super::super::Result;
 
-/// How long `AXON` looks for a message before it sleeps, where sleeps have been short.
+/// The time for which AXON polls for a message before it sleeps, if recent sleeps were short.
 const SPIN: Duration = Duration::from_micros(50);
-/// Looks between two looks at the clock.
+/// The number of polls between two readings of the clock.
 const LOOKS: u32 = 8;
 
-/// What a receiver of the raw limit does while there is nothing.
+/// How a receiver of the raw limit waits for a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Sleeps {
-    /// It sleeps in epoll, on an eventfd; the sender rings for each message.
+    /// The receiver sleeps in epoll, on an eventfd. The sender writes the eventfd for each message.
     Epoll,
-    /// It looks for as long as AXON does before it sleeps so; the sender rings only where it sleeps.
+    /// The receiver polls for as long as AXON does, then sleeps in epoll. The sender writes the eventfd only if the
+    /// receiver sleeps.
     SpinEpoll,
-    /// It sleeps on a futex; the sender wakes it only where it sleeps.
+    /// The receiver sleeps on a futex. The sender wakes it only if it sleeps.
     Futex,
 }
 
@@ -42,18 +43,18 @@ impl Sleeps {
     }
 }
 
-/// One direction's word that says whether its receiver sleeps, in memory that both processes share.
+/// The word of one direction that tells whether its receiver sleeps, in memory that both processes share.
 pub(super) struct Asleep<'a>(pub(super) &'a AtomicU32);
 
 impl Asleep<'_> {
-    /// Sender, after it has stored the message: whether the receiver has to be woken.
+    /// Called by the sender after it has stored the message. Returns whether the receiver has to be woken.
     fn ended(&self) -> bool {
-        // Pairs with the fence of the receiver: one of the two sees what the other stored.
+        // Pairs with the receiver's fence in `begun`: at least one of the two sees what the other stored.
         fence(Ordering::SeqCst);
         self.0.load(Ordering::Relaxed) != 0 && self.0.swap(0, Ordering::Relaxed) != 0
     }
 
-    /// Receiver: whether nothing came until others could know that it sleeps.
+    /// Called by the receiver. Announces that it sleeps, and returns whether still no message has come.
     fn begun(&self, ready: impl Fn() -> bool) -> bool {
         self.0.store(1, Ordering::Relaxed);
         fence(Ordering::SeqCst);
@@ -65,7 +66,7 @@ impl Asleep<'_> {
     }
 }
 
-/// Sender: wakes the receiver of what it has just stored.
+/// Called by the sender. Wakes the receiver after a message was stored.
 pub(super) fn wake(how: Sleeps, asleep: &Asleep<'_>, bell: &OwnedFd) -> Result<()> {
     match how {
         Sleeps::Epoll => drop(write(bell, &1u64.to_ne_bytes())?),
@@ -76,7 +77,7 @@ pub(super) fn wake(how: Sleeps, asleep: &Asleep<'_>, bell: &OwnedFd) -> Result<(
     Ok(())
 }
 
-/// Receiver: sleeps until `ready`, or with [`Sleeps::Epoll`] until the next ring.
+/// Called by the receiver. Sleeps until `ready`, or with [`Sleeps::Epoll`] until the next write of the eventfd.
 pub(super) fn sleep(
     how: Sleeps,
     asleep: &Asleep<'_>,
@@ -86,7 +87,7 @@ pub(super) fn sleep(
     match how {
         Sleeps::Epoll => bell.until_rung(),
         Sleeps::SpinEpoll => {
-            // A ring may be left over from when the message came just before the sleep.
+            // The eventfd may still be set by a message that came just before an earlier sleep.
             while !spin(&ready) && asleep.begun(&ready) {
                 bell.until_rung()?;
             }
@@ -124,17 +125,17 @@ pub(super) struct Bell {
     bell: OwnedFd,
     set: OwnedFd,
     events: Vec<epoll::Event>,
-    /// Rings that came and have not been asked for.
+    /// Writes of the eventfd that were read and not yet consumed.
     rings: u64,
 }
 
 impl Bell {
-    /// A new eventfd.
+    /// Creates an eventfd.
     pub(super) fn cast() -> Result<OwnedFd> {
         Ok(eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?)
     }
 
-    /// Listens to it.
+    /// Adds an eventfd to a new epoll set.
     pub(super) fn listen(bell: OwnedFd) -> Result<Self> {
         let set = epoll::create(epoll::CreateFlags::CLOEXEC)?;
         epoll::add(&set, bell.as_fd(), epoll::EventData::new_u64(0), epoll::EventFlags::IN)?;
