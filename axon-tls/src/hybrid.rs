@@ -1,8 +1,7 @@
-//! X25519MLKEM768 and nothing else, on rustls as released.
+//! Connections with X25519MLKEM768 only, on the released rustls.
 //!
-//! X25519MLKEM768 is one group: its secret is safe as long as either X25519 or ML-KEM-768 is. A
-//! peer that offers neither it nor TLS 1.3 is refused with a `handshake_failure` or
-//! `protocol_version` alert.
+//! X25519MLKEM768 is one group. Its secret is safe as long as X25519 or ML-KEM-768 is. A peer that does not offer the
+//! group or TLS 1.3 is refused with a `handshake_failure` or `protocol_version` alert.
 //!
 //! ```
 //! use std::sync::Arc;
@@ -35,7 +34,7 @@ use crate::identity::{Auth, SpkiDigest};
 use crate::negotiated::protocols;
 use crate::{Cipher, Error, KeyExchange, Negotiated};
 
-/// aws-lc-rs with X25519MLKEM768 alone and the TLS 1.3 suites with 256-bit keys alone.
+/// Returns aws-lc-rs with only X25519MLKEM768 and only the TLS 1.3 suites with 256-bit keys.
 ///
 /// Their HKDF erases the secrets that it held.
 pub fn provider() -> CryptoProvider {
@@ -46,7 +45,7 @@ pub fn provider() -> CryptoProvider {
     }
 }
 
-/// The same with one cipher suite.
+/// As [`provider()`], with one cipher suite.
 pub fn provider_with(cipher: Cipher) -> CryptoProvider {
     CryptoProvider { cipher_suites: vec![suite(cipher)], ..provider() }
 }
@@ -55,8 +54,8 @@ fn provider_without_resumption(cipher: Cipher) -> CryptoProvider {
     CryptoProvider { cipher_suites: vec![suite_without_resumption(cipher)], ..provider() }
 }
 
-/// A builder of your own client configuration, which goes on where it is chosen how the server's
-/// certificate is verified.
+/// Returns a builder for the caller's own client configuration. The next step chooses how the server's certificate is
+/// verified.
 ///
 /// ```
 /// use axon_tls::{hybrid, rustls};
@@ -72,7 +71,7 @@ pub fn client_builder() -> ConfigBuilder<ClientConfig, WantsVerifier> {
         .expect("the provider has suites and a group of TLS 1.3")
 }
 
-/// A builder of your own server configuration, which goes on where it is chosen whether clients show
+/// Returns a builder for the caller's own server configuration. The next step chooses whether clients show
 /// certificates.
 pub fn server_builder() -> ConfigBuilder<ServerConfig, WantsVerifier> {
     ServerConfig::builder_with_provider(Arc::new(provider()))
@@ -80,11 +79,11 @@ pub fn server_builder() -> ConfigBuilder<ServerConfig, WantsVerifier> {
         .expect("the provider has suites and a group of TLS 1.3")
 }
 
-/// The suite that protects Initial packets of QUIC (RFC 9001 section 5.2), for
+/// Returns the suite that protects Initial packets of QUIC (RFC 9001 section 5.2), for
 /// `quinn::crypto::rustls::QuicServerConfig::with_initial()` and `QuicClientConfig::with_initial()`.
 ///
-/// TLS offers it nowhere: it is not in [`provider()`]. The keys of Initial packets are made from what is
-/// on the wire, and protect nothing from anybody. The module `quic` uses it by itself.
+/// TLS never offers it: it is not in [`provider()`]. The keys of Initial packets are derived from public bytes of the
+/// packets, so they protect nothing from an observer. The module `quic` uses the suite automatically.
 pub fn quic_initial_suite() -> rustls::quic::Suite {
     TLS13_AES_128_GCM_SHA256
         .tls13()
@@ -92,13 +91,14 @@ pub fn quic_initial_suite() -> rustls::quic::Suite {
         .expect("aws-lc-rs has AES-128-GCM for QUIC")
 }
 
-/// A client's configuration, with one ALPN protocol, or none if `alpn` is empty.
+/// Makes a client's configuration with one ALPN protocol, or none if `alpn` is empty.
 ///
-/// It resumes nothing. The resumption secret of its connections is made of random bytes, so that none is in memory: with
-/// resumption turned on a server would refuse what it is offered. [`client_builder()`] makes one that can resume.
+/// Its connections resume no session. The resumption secret of each connection is replaced by random bytes, so that
+/// memory holds no such secret. If resumption were turned on, a server would refuse what the client offers.
+/// [`client_builder()`] makes a configuration that can resume.
 ///
-/// No server name is sent: what the connection is made with says which certificate is accepted
-/// under [`Auth::Ca`], and nothing under the others.
+/// No server name is sent. The name with which the connection is made selects the accepted certificate under
+/// [`Auth::Ca`], and has no effect otherwise.
 pub fn client_config(auth: &Auth, cipher: Cipher, alpn: &[u8]) -> Result<ClientConfig, Error> {
     let builder =
         ClientConfig::builder_with_provider(Arc::new(provider_without_resumption(cipher)))
@@ -110,9 +110,9 @@ pub fn client_config(auth: &Auth, cipher: Cipher, alpn: &[u8]) -> Result<ClientC
     Ok(config)
 }
 
-/// A server's configuration, with one ALPN protocol, or none if `alpn` is empty.
+/// Makes a server's configuration with one ALPN protocol, or none if `alpn` is empty.
 ///
-/// It issues no tickets, and makes no resumption secret either, as [`client_config()`].
+/// It issues no tickets, and like [`client_config()`] it makes no resumption secret.
 pub fn server_config(auth: &Auth, cipher: Cipher, alpn: &[u8]) -> Result<ServerConfig, Error> {
     let builder =
         ServerConfig::builder_with_provider(Arc::new(provider_without_resumption(cipher)))
@@ -124,11 +124,11 @@ pub fn server_config(auth: &Auth, cipher: Cipher, alpn: &[u8]) -> Result<ServerC
     Ok(config)
 }
 
-/// What a finished handshake agreed on; `None` while it is under way.
+/// Returns the result of a finished handshake. Returns `None` while the handshake is in progress.
 ///
-/// Takes any connection of rustls, over TCP or QUIC: each dereferences to a [`CommonState`].
-/// Also `None` if something other than this module offers was agreed on, which a connection made
-/// from its configurations cannot do.
+/// It accepts any connection of rustls, over TCP or QUIC, because each dereferences to a [`CommonState`]. It also
+/// returns `None` if the handshake negotiated something that this module does not offer. A connection made from its
+/// configurations cannot do that.
 pub fn negotiated(conn: &CommonState) -> Option<Negotiated> {
     if conn.is_handshaking() {
         return None;
@@ -145,8 +145,8 @@ pub fn negotiated(conn: &CommonState) -> Option<Negotiated> {
     })
 }
 
-/// Refuses a configuration that offers or takes anything but the hybrid group and 256-bit suites of
-/// TLS 1.3, or that has early data.
+/// Refuses a configuration that permits anything except the hybrid group and 256-bit suites of TLS 1.3, or that has
+/// early data.
 #[cfg(feature = "quic")]
 pub(crate) fn check(provider: &CryptoProvider, early_data: bool) -> Result<(), Error> {
     let not_hybrid = |what: String| Err(Error::NotHybrid(what));

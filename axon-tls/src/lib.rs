@@ -1,29 +1,28 @@
 //! TLS 1.3 and QUIC connections that cannot fall back to a classical-only key exchange.
 //!
-//! Two ways to agree on keys, and no third:
+//! There are two ways to agree on keys:
 //!
-//! - `hybrid`: the group X25519MLKEM768 alone, on [rustls](https://docs.rs/rustls) as released.
-//!   Who the peer is, is chosen with `identity::Auth`, or in a rustls configuration of your own.
-//! - [`psk`]: an external pre-shared key, on [`rustls_axon`]. The key authenticates both ends; there
-//!   are no certificates. [`qkd`] makes the key from one that a quantum key distribution system gave to
-//!   both ends.
+//! - `hybrid`: only the group X25519MLKEM768, on the released [rustls](https://docs.rs/rustls). `identity::Auth`, or
+//!   the caller's own rustls configuration, chooses the authentication of the peer.
+//! - [`psk`]: an external pre-shared key, on [`rustls_axon`]. The key authenticates both ends; there are no
+//!   certificates. [`qkd`] derives the key from one that a quantum key distribution system gave to both ends.
 //!
-//! Both offer 256-bit [`Cipher`]s and TLS 1.3 alone, and refuse whatever else the peer proposes. The
-//! configurations that this crate makes have one cipher, no tickets, no early data and no key log.
+//! Both offer only 256-bit [`Cipher`]s and TLS 1.3, and refuse all other proposals of the peer. The configurations that
+//! this crate makes have one cipher, no tickets, no early data and no key log.
 //!
-//! After the handshake [`Negotiated`] says what was agreed, read from the connection and not from
-//! the configuration.
+//! After the handshake [`Negotiated`] tells what was negotiated. It is read from the connection and not from the
+//! configuration.
 //!
 //! # Features
 //!
 //! - `hybrid` (default): the modules `hybrid` and `identity`, on stock rustls, re-exported as `rustls`.
 //! - `quic`: both modes for [quinn](https://docs.rs/quinn), in the module `quic`, with `quinn` re-exported.
-//! - `tokio`: connections of rustls-axon over byte streams of tokio, in the module `stream`. Those of stock
-//!   rustls are what [tokio-rustls](https://docs.rs/tokio-rustls) is for.
+//! - `tokio`: connections of rustls-axon over byte streams of tokio, in the module `stream`. For connections of stock
+//!   rustls use [tokio-rustls](https://docs.rs/tokio-rustls).
 //!
 //! # Example
 //!
-//! A configuration of rustls for a client that knows servers by their certificates:
+//! This is a configuration of rustls for a client that verifies servers by their certificates:
 //!
 //! ```
 //! # #[cfg(feature = "hybrid")] {

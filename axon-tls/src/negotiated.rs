@@ -1,4 +1,4 @@
-//! What peers choose from, and what they agreed on.
+//! The ciphers and key exchanges that peers choose from, and the result of their negotiation.
 
 use std::fmt;
 use std::str::FromStr;
@@ -11,8 +11,7 @@ use crate::identity::SpkiDigest;
 
 /// The cipher suite of a connection: TLS 1.3 with a 256-bit key.
 ///
-/// A configuration has exactly one. It also fixes the hash of the key schedule and of a
-/// pre-shared key.
+/// A configuration has exactly one. It also determines the hash of the key schedule and of a pre-shared key.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub enum Cipher {
     /// TLS_CHACHA20_POLY1305_SHA256
@@ -23,10 +22,10 @@ pub enum Cipher {
 }
 
 impl Cipher {
-    /// Every cipher.
+    /// All ciphers.
     pub const ALL: [Self; 2] = [Self::ChaCha20Poly1305, Self::Aes256Gcm];
 
-    /// The name used in configuration: `chacha20-poly1305` or `aes-256-gcm`.
+    /// Returns the name used in configuration: `chacha20-poly1305` or `aes-256-gcm`.
     pub const fn name(self) -> &'static str {
         match self {
             Self::ChaCha20Poly1305 => "chacha20-poly1305",
@@ -34,7 +33,7 @@ impl Cipher {
         }
     }
 
-    /// The hash of the cipher suite.
+    /// Returns the hash of the cipher suite.
     pub(crate) const fn hash(self) -> HashAlgorithm {
         match self {
             Self::ChaCha20Poly1305 => HashAlgorithm::SHA256,
@@ -43,10 +42,10 @@ impl Cipher {
     }
 }
 
-/// How a pre-shared key is used (RFC 8446 section 4.2.9).
+/// The use of a pre-shared key (RFC 8446 section 4.2.9).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub enum PskKex {
-    /// The key alone. No forward secrecy: who learns the key later reads a recorded connection.
+    /// The key alone. There is no forward secrecy: an attacker who learns the key later can read a recorded connection.
     #[default]
     PskKe,
     /// The key together with X25519MLKEM768.
@@ -57,7 +56,7 @@ impl PskKex {
     /// Both modes.
     pub const ALL: [Self; 2] = [Self::PskKe, Self::PskDheKe];
 
-    /// The name used in configuration: `psk_ke` or `psk_dhe_ke`.
+    /// Returns the name used in configuration: `psk_ke` or `psk_dhe_ke`.
     pub const fn name(self) -> &'static str {
         match self {
             Self::PskKe => "psk_ke",
@@ -88,28 +87,28 @@ impl fmt::Display for KeyExchange {
     }
 }
 
-/// What a finished handshake agreed on, as the connection tells it.
+/// The result of a finished handshake, as the connection reports it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Negotiated {
-    /// How the keys were agreed on.
+    /// The key exchange.
     pub key_exchange: KeyExchange,
     /// The cipher suite.
     pub cipher: Cipher,
-    /// The identity of the pre-shared key, if the connection runs on one.
+    /// The identity of the pre-shared key, if the connection uses one.
     pub psk_identity: Option<Vec<u8>>,
-    /// The digest of the peer's public key. `None` on a pre-shared key, and for a client that was not
-    /// asked for a certificate.
+    /// The digest of the peer's public key. It is `None` on a pre-shared key, and for a client that was not asked for a
+    /// certificate.
     ///
-    /// The peer has proven that it has the private key. Whether that says who it is, depends on
-    /// the [`Auth`](crate::identity::Auth) of the configuration.
+    /// The peer has proved that it has the private key. Whether this identifies the peer depends on the
+    /// [`Auth`](crate::identity::Auth) of the configuration.
     #[cfg(feature = "hybrid")]
     pub peer: Option<SpkiDigest>,
-    /// The application protocol; empty if none was configured.
+    /// The application protocol. It is empty if none was configured.
     pub alpn: Vec<u8>,
 }
 
-/// The protocols of a configuration with one, or with none if `alpn` is empty.
+/// Returns the list of protocols of a configuration: one, or none if `alpn` is empty.
 pub(crate) fn protocols(alpn: &[u8]) -> Result<Vec<Vec<u8>>, Error> {
     match alpn.len() {
         0 => Ok(Vec::new()),
@@ -118,7 +117,7 @@ pub(crate) fn protocols(alpn: &[u8]) -> Result<Vec<Vec<u8>>, Error> {
     }
 }
 
-/// A name that is not one of those accepted.
+/// A name that is not one of the accepted names.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("`{given}` is not one of {accepted}")]
 pub struct UnknownName {

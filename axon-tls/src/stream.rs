@@ -1,9 +1,9 @@
 //! Connections of rustls-axon over byte streams of tokio.
 //!
-//! What [tokio-rustls](https://docs.rs/tokio-rustls) is for rustls as released, [`TlsConnector`],
-//! [`TlsAcceptor`] and [`TlsStream`] are for [`rustls_axon`]: over a `TcpStream`, a `UnixStream` or anything
-//! else that is `AsyncRead + AsyncWrite + Unpin`. They take any configuration of rustls-axon; those of
-//! [`crate::psk`] and [`crate::qkd`] complete on a pre-shared key or fail.
+//! [`TlsConnector`], [`TlsAcceptor`] and [`TlsStream`] are for [`rustls_axon`] what
+//! [tokio-rustls](https://docs.rs/tokio-rustls) is for the released rustls. They work over a `TcpStream`, a
+//! `UnixStream` or any type that is `AsyncRead + AsyncWrite + Unpin`. They take any configuration of rustls-axon.
+//! Configurations of [`crate::psk`] and [`crate::qkd`] complete on a pre-shared key or fail.
 //!
 //! ```
 //! use std::sync::Arc;
@@ -38,21 +38,21 @@
 //!
 //! # The end of a stream
 //!
-//! - `shutdown()` sends a close_notify alert and then shuts the underlying stream down for writing. Reading
-//!   goes on until the peer does the same (RFC 8446 section 6.1).
+//! - `shutdown()` sends a close_notify alert and then shuts the underlying stream down for writing. Reading continues
+//!   until the peer does the same (RFC 8446 section 6.1).
 //! - A read of 0 bytes means that the peer sent close_notify: nothing is missing.
-//! - An underlying stream that ends without close_notify was cut off, by a crash or an attacker. What
-//!   arrived before is read first, and then the error is [`io::ErrorKind::UnexpectedEof`].
-//! - A stream that is dropped sends no close_notify: its peer sees that error. Data that was accepted for
-//!   writing is sent for certain once `flush()` or `shutdown()` has returned.
-//! - What violates the protocol, a changed record among it, is [`io::ErrorKind::InvalidData`] with the
-//!   [`rustls_axon::Error`] inside. The peer is told by an alert, and the stream is of no use from then on.
+//! - An underlying stream that ends without close_notify was cut off, by a crash or an attacker. What arrived before is
+//!   read first, and then the error is [`io::ErrorKind::UnexpectedEof`].
+//! - A stream that is dropped sends no close_notify: its peer sees that error. Data that was accepted for writing is
+//!   certainly sent only after `flush()` or `shutdown()` has returned.
+//! - A violation of the protocol, for example a changed record, is [`io::ErrorKind::InvalidData`] with the
+//!   [`rustls_axon::Error`] inside. The peer receives an alert, and the stream can no longer be used.
 //!
 //! # Cancel safety
 //!
-//! Dropping a future of [`connect()`](TlsConnector::connect) or [`accept()`](TlsAcceptor::accept) drops the
-//! underlying stream: put a timeout around it, since a peer may never answer. Reads and writes are as cancel
-//! safe as those of a `TcpStream`: `read()` and `write()` are, and `read_exact()` and `write_all()` are not.
+//! Dropping a future of [`connect()`](TlsConnector::connect) or [`accept()`](TlsAcceptor::accept) drops the underlying
+//! stream. Use a timeout around it, because a peer may never answer. Reads and writes are as cancel safe as those of a
+//! `TcpStream`: `read()` and `write()` are, and `read_exact()` and `write_all()` are not.
 
 use std::fmt;
 use std::io::{self, IoSlice, Read, Write};
@@ -69,28 +69,28 @@ use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use crate::Negotiated;
 use crate::erase::{erasing_stack, erasing_stack_of_record};
 
-/// Makes connections to servers.
+/// Connects to servers.
 #[derive(Clone)]
 pub struct TlsConnector {
     config: Arc<ClientConfig>,
 }
 
 impl TlsConnector {
-    /// Shakes hands over `io` as the client.
+    /// Performs the handshake over `io` as the client.
     ///
     /// `name` is for configurations that check or send the server's name, which those of this crate do not.
     ///
-    /// The server may still refuse the client after this has returned: it is the first read that tells.
+    /// The server may still refuse the client after this has returned. The first read reports that.
     ///
     /// # Errors
-    /// Those of `io`; [`io::ErrorKind::UnexpectedEof`] if it ends during the handshake;
-    /// [`io::ErrorKind::InvalidData`] if either end refuses the other; [`io::ErrorKind::InvalidInput`] if the
-    /// configuration cannot make a connection, because its keys are erased, say.
+    /// Those of `io`; [`io::ErrorKind::UnexpectedEof`] if it ends during the handshake; [`io::ErrorKind::InvalidData`]
+    /// if either end refuses the other; [`io::ErrorKind::InvalidInput`] if the configuration cannot make a connection,
+    /// for example because its keys are erased.
     pub async fn connect<IO>(&self, name: ServerName<'static>, io: IO) -> io::Result<TlsStream<IO>>
     where
         IO: AsyncRead + AsyncWrite + Unpin,
     {
-        // the ClientHello has a binder, which is made with the pre-shared key
+        // the ClientHello has a binder, which is computed with the pre-shared key
         let new = || ClientConnection::new(Arc::clone(&self.config), name).map(Connection::from);
         TlsStream::new(erasing_stack(new), io)?.shake_hands().await
     }
@@ -108,17 +108,17 @@ impl fmt::Debug for TlsConnector {
     }
 }
 
-/// Takes the connections of clients.
+/// Accepts the connections of clients.
 #[derive(Clone)]
 pub struct TlsAcceptor {
     config: Arc<ServerConfig>,
 }
 
 impl TlsAcceptor {
-    /// Shakes hands over `io` as the server. The client's Finished was verified when this returns.
+    /// Performs the handshake over `io` as the server. The client's Finished has been verified when this returns.
     ///
     /// # Errors
-    /// As [`TlsConnector::connect()`].
+    /// The same as for [`TlsConnector::connect()`].
     pub async fn accept<IO>(&self, io: IO) -> io::Result<TlsStream<IO>>
     where
         IO: AsyncRead + AsyncWrite + Unpin,
@@ -142,36 +142,37 @@ impl fmt::Debug for TlsAcceptor {
 
 /// A TLS connection over `IO` whose handshake is complete.
 ///
-/// The [module](self) says how it ends and what is cancel safe.
+/// The [module](self) describes how it ends and which operations are cancel safe.
 pub struct TlsStream<IO> {
     io: IO,
     conn: Connection,
-    /// Why the connection is of no use any more.
+    /// The reason why the connection can no longer be used.
     failed: Option<Error>,
-    /// Whether writing was ended.
+    /// Whether writing has ended.
     shut_down: bool,
-    /// Whether `io` has the waker of a task that waits to write: a task that reads must not replace it.
+    /// Whether `io` holds the waker of a task that waits to write. A task that reads must not replace it.
     writer_waits: bool,
 }
 
 impl<IO> TlsStream<IO> {
-    /// What was agreed on. `None` if the connection is not on an external pre-shared key, which one of
-    /// [`crate::psk`] always is.
+    /// Returns the result of the handshake. Returns `None` if the connection is not on an external pre-shared key. A
+    /// connection of [`crate::psk`] always is.
     pub fn negotiated(&self) -> Option<Negotiated> {
         crate::psk::negotiated(&self.conn)
     }
 
-    /// The connection, to ask it or to export keying material.
+    /// Returns the connection, for queries and to export keying material.
     pub fn connection(&self) -> &Connection {
         &self.conn
     }
 
-    /// The underlying stream.
+    /// Returns the underlying stream.
     pub fn get_ref(&self) -> &IO {
         &self.io
     }
 
-    /// The underlying stream, without the connection. What was read from it or not yet written to it is lost.
+    /// Returns the underlying stream, without the connection. Bytes that were read from it, or not yet written to it,
+    /// are lost.
     pub fn into_inner(self) -> IO {
         self.io
     }
@@ -192,7 +193,7 @@ impl<IO: AsyncRead + AsyncWrite + Unpin> TlsStream<IO> {
         loop {
             let sent = match self.poll_send(cx) {
                 Poll::Ready(Err(err)) => {
-                    // a peer that refused us and is gone may have left the reason
+                    // a peer that refused this end and closed the stream may have sent the reason before
                     let _ = self.poll_receive(cx);
                     return Poll::Ready(Err(self.failure().unwrap_or(err)));
                 }
@@ -209,7 +210,7 @@ impl<IO: AsyncRead + AsyncWrite + Unpin> TlsStream<IO> {
                 }
                 Poll::Ready(_) => {}
                 Poll::Pending => {
-                    // the peer cannot answer what is in a buffer of `io`
+                    // the peer cannot answer bytes that are still in a buffer of `io`
                     if sent.is_ready() {
                         let _ = self.poll_flush_io(cx)?;
                     }
@@ -219,7 +220,7 @@ impl<IO: AsyncRead + AsyncWrite + Unpin> TlsStream<IO> {
         }
     }
 
-    /// Reads once from `io`, and handles what has come. Ready with 0 at the end of `io`.
+    /// Reads once from `io`, and processes the received bytes. Ready with 0 at the end of `io`.
     fn poll_receive(&mut self, cx: &mut Context<'_>) -> Poll<io::Result<usize>> {
         let mut from = Blocking { io: &mut self.io, cx };
         let len = match self.conn.read_tls(&mut from) {
@@ -234,7 +235,7 @@ impl<IO: AsyncRead + AsyncWrite + Unpin> TlsStream<IO> {
         };
         if let Err(err) = handled {
             self.failed = Some(err);
-            // The alert. Where a task waits to write, that one sends it as soon as it can.
+            // This sends the alert. If a task waits to write, that task sends the alert as soon as it can.
             if !self.writer_waits {
                 let _ = self.poll_send(cx);
             }
@@ -243,7 +244,7 @@ impl<IO: AsyncRead + AsyncWrite + Unpin> TlsStream<IO> {
         Poll::Ready(Ok(len))
     }
 
-    /// Writes all that the connection has for the peer.
+    /// Writes all bytes that the connection has for the peer.
     fn poll_send(&mut self, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
         while self.conn.wants_write() {
             match self.conn.write_tls(&mut Blocking { io: &mut self.io, cx }) {
@@ -266,7 +267,7 @@ impl<IO: AsyncRead + AsyncWrite + Unpin> TlsStream<IO> {
         flushed
     }
 
-    /// Has the connection take data to write, which `take` gives it.
+    /// Gives the connection data to write. `take` passes the data.
     fn poll_take(
         &mut self,
         cx: &mut Context<'_>,
@@ -276,7 +277,7 @@ impl<IO: AsyncRead + AsyncWrite + Unpin> TlsStream<IO> {
             let why = "the stream was shut down for writing";
             return Poll::Ready(Err(io::Error::new(io::ErrorKind::BrokenPipe, why)));
         }
-        // nothing is taken before what was taken last is gone, so no more than one buffer is held back
+        // new data is accepted only after the previous data has been sent, so at most one buffer is held back
         let sent = self.poll_send(cx);
         if let Some(failure) = self.failure() {
             return Poll::Ready(Err(failure));
@@ -284,7 +285,7 @@ impl<IO: AsyncRead + AsyncWrite + Unpin> TlsStream<IO> {
         ready!(sent)?;
         let conn = &mut self.conn;
         let taken = erasing_stack_of_record(|| take(&mut conn.writer()))?;
-        // What does not go out now goes out on the next call: it was taken, so the answer is how much.
+        // Data that is not sent now is sent by the next call. It was accepted, so the result is its length.
         match self.poll_send(cx) {
             Poll::Ready(Err(err)) => Poll::Ready(Err(err)),
             _ => Poll::Ready(Ok(taken)),
@@ -315,7 +316,7 @@ impl<IO: AsyncRead + AsyncWrite + Unpin> AsyncRead for TlsStream<IO> {
                 return Poll::Ready(Err(failure));
             }
             match ready!(self.poll_receive(cx)) {
-                // what was good comes first, and the error the next time round
+                // valid data is returned first, and the error on the next iteration
                 Err(err) if self.failed.is_none() => return Poll::Ready(Err(err)),
                 _ => {}
             }
@@ -353,7 +354,7 @@ impl<IO: AsyncRead + AsyncWrite + Unpin> AsyncWrite for TlsStream<IO> {
     fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
         if !self.shut_down {
             self.shut_down = true;
-            // after a failure its alert is what the peer gets
+            // after a failure the peer receives the alert of the failure instead
             if self.failed.is_none() {
                 let conn = &mut self.conn;
                 erasing_stack_of_record(|| conn.send_close_notify());
@@ -363,7 +364,7 @@ impl<IO: AsyncRead + AsyncWrite + Unpin> AsyncWrite for TlsStream<IO> {
         let shut = Pin::new(&mut self.io).poll_shutdown(cx);
         self.writer_waits = shut.is_pending();
         match ready!(shut) {
-            // the peer was faster: there is nothing left to shut
+            // the peer closed the stream first, so there is nothing left to shut down
             Err(err) if err.kind() == io::ErrorKind::NotConnected => Poll::Ready(Ok(())),
             shut => Poll::Ready(shut),
         }
@@ -376,7 +377,7 @@ impl<IO> fmt::Debug for TlsStream<IO> {
     }
 }
 
-/// An asynchronous stream for the time of one call, with the interface of a blocking one that would block.
+/// Adapts an asynchronous stream to the blocking traits for one call. It returns `WouldBlock` instead of waiting.
 struct Blocking<'a, 'cx, IO> {
     io: &'a mut IO,
     cx: &'a mut Context<'cx>,

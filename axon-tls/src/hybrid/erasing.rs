@@ -1,8 +1,7 @@
-//! Cipher suites of rustls as released, with the HKDF of rustls-axon.
+//! Cipher suites of the released rustls, with the HKDF of rustls-axon.
 //!
-//! The HKDF of rustls's own provider leaves the salt of each step, which is a secret in the key
-//! schedule of TLS, in freed memory. Secrets that rustls itself holds by value, such as those of
-//! the traffic, are beyond what a provider can erase.
+//! The HKDF of rustls's own provider leaves the salt of each step, which is a secret in the key schedule of TLS, in
+//! freed memory. A provider cannot erase secrets that rustls itself holds by value, for example traffic secrets.
 
 use std::sync::LazyLock;
 
@@ -23,8 +22,8 @@ pub(super) fn suite(cipher: Cipher) -> SupportedCipherSuite {
     })
 }
 
-/// The same, for configurations that resume nothing: rustls computes the resumption secret of each connection
-/// nevertheless, and a client keeps it as long as the connection stands. Here it is made of random bytes instead.
+/// As [`suite`], for configurations that resume nothing. rustls computes the resumption secret of each connection even
+/// so, and a client keeps it for as long as the connection exists. This suite returns random bytes instead.
 pub(super) fn suite_without_resumption(cipher: Cipher) -> SupportedCipherSuite {
     SupportedCipherSuite::Tls13(match cipher {
         Cipher::ChaCha20Poly1305 => &CHACHA20_POLY1305_SHA256_UNRESUMED,
@@ -62,7 +61,7 @@ fn with_hkdf(hkdf_provider: &'static Erasing) -> Tls13CipherSuite {
 /// The HKDF of rustls-axon, with the types of rustls.
 struct Erasing {
     cipher: Cipher,
-    /// Whether resumption secrets are made.
+    /// Whether resumption secrets are computed.
     resumes: bool,
 }
 
@@ -99,10 +98,11 @@ impl Hkdf for Erasing {
     }
 }
 
-/// What a resumption secret is expanded with: its length, that of its label, and the label (RFC 8446, section 7.1).
+/// The beginning of the HkdfLabel of the resumption secret, after the output length: the label's length, and the label
+/// (RFC 8446, section 7.1).
 const RESUMPTION: &[u8] = b"\x10tls13 res master";
 
-/// Whether HkdfLabel is that of the resumption secret.
+/// Returns whether an HkdfLabel is that of the resumption secret.
 fn is_resumption(info: &[&[u8]]) -> bool {
     info.iter().copied().flatten().skip(2).take(RESUMPTION.len()).eq(RESUMPTION)
 }
@@ -119,7 +119,7 @@ impl HkdfExpander for Expander {
 
     fn expand_block(&self, info: &[&[u8]]) -> OkmBlock {
         if !self.resumes && is_resumption(info) {
-            // Not a constant, which would let others resume, if somebody turned resumption on.
+            // A constant would let others resume the session if resumption were turned on by mistake.
             let mut random = [0; OkmBlock::MAX_LEN];
             let random = &mut random[..self.hkdf.hash_len()];
             aws_lc_rs::rand::fill(random).expect("the system has random bytes");
@@ -137,7 +137,7 @@ impl HkdfExpander for Expander {
 mod tests {
     use super::*;
 
-    /// Expands a label without a context from a secret that is the same each time.
+    /// Expands a label without a context from a fixed secret.
     fn expand(suite: SupportedCipherSuite, label: &str) -> Vec<u8> {
         let hkdf = suite.tls13().unwrap().hkdf_provider;
         let expander = hkdf.extract_from_secret(None, b"secret");

@@ -1,4 +1,4 @@
-//! Certificates from given roots.
+//! Authentication by certificates from given roots.
 
 use std::sync::Arc;
 
@@ -17,13 +17,13 @@ use super::verifier::{Peers, Role, Verifier};
 use super::{pem, signing_key};
 use crate::{CaPart, Error};
 
-/// Roots, our certificate and its key, and the certificates that were revoked.
+/// The roots, this end's certificate and key, and the revocation lists.
 ///
-/// Each end checks that the other's certificate comes from the roots, is in date, is for the role of
-/// a client or a server if it is limited to one, and was not revoked. With a revocation list, every
-/// issuer in the peer's chain needs one that is in date, and of several each is heeded. A client checks the server's name too,
-/// against the one it connects with. Which client it is, is for the application of the server to
-/// check, with [`CaMaterial::is_for_host()`].
+/// Each end checks that the other's certificate comes from the roots, is in date, permits the role of a client or a
+/// server, and was not revoked. If there are revocation lists, every issuer in the peer's chain needs one that is in
+/// date. If an issuer has several lists, all of them apply. A client also checks that the server's certificate is for
+/// the name to which it connects. The application of the server has to check the identity of a client, with
+/// [`CaMaterial::is_for_host()`].
 pub struct CaMaterial {
     roots: Arc<RootCertStore>,
     ours: Arc<CertifiedKey>,
@@ -32,12 +32,12 @@ pub struct CaMaterial {
 }
 
 impl CaMaterial {
-    /// Reads PEM texts: the roots, our certificate with the chain to a root, its PKCS#8 key, and
-    /// revocation lists if there are any.
+    /// Reads PEM texts: the roots, this end's certificate with the chain to a root, its PKCS#8 key, and optional
+    /// revocation lists.
     ///
     /// # Errors
-    /// A text that cannot be used, a key that is not the certificate's, or revocation lists of which
-    /// none is of a root: with them nobody could be accepted.
+    /// A text cannot be used, the key does not belong to the certificate, or no revocation list is of a root. In the
+    /// last case no peer could be accepted.
     pub fn from_pem(
         roots: &str,
         chain: &str,
@@ -50,7 +50,7 @@ impl CaMaterial {
         }
         let chain = certificates(CaPart::Chain, chain)?;
         let key = private_key(key).map_err(|err| unusable(CaPart::Key, err))?;
-        // Roots are keys with a name, of which no extension is asked.
+        // Roots may be of an old version, because only their names and keys are used.
         if chain.iter().any(is_of_old_version) {
             return Err(unusable(CaPart::Chain, Refused::OldVersion));
         }
@@ -75,42 +75,42 @@ impl CaMaterial {
         })
     }
 
-    /// Leaves the server's name to the application too, for protocols in which both ends say who
-    /// they are once they are connected.
+    /// Leaves the check of the server's name to the application, for protocols in which both ends send their names
+    /// after they have connected.
     ///
-    /// **The caller must check the name that each peer says with [`CaMaterial::is_for_host()`]**:
-    /// until then any holder of a certificate from the roots can be the server.
+    /// **The caller must check the name that each peer sends with [`CaMaterial::is_for_host()`]**: until then any
+    /// holder of a certificate from the roots can be the server.
     #[must_use]
     pub fn with_names_checked_by_application(mut self) -> Self {
         self.names_checked_later = true;
         self
     }
 
-    /// Whether a peer that showed `certificate` may call itself `host`: one of the certificate's
-    /// DNS names is exactly that. A wildcard is not.
+    /// Returns whether a peer with `certificate` may use the name `host`. One of the certificate's DNS names must be
+    /// exactly that; a wildcard is not enough.
     pub fn is_for_host(certificate: &CertificateDer<'_>, host: &str) -> bool {
         roots::is_for_host(certificate, host)
     }
 
-    /// The hosts that our own certificate is for: its DNS names without wildcards.
+    /// Returns the hosts that this end's own certificate is for: its DNS names without wildcards.
     pub fn our_hosts(&self) -> Vec<String> {
         roots::host_names(&self.ours.cert[0])
     }
 
-    /// Whether a client that showed `chain` would be accepted now: certificates run out, and later
-    /// material has other roots and lists than that which accepted it.
+    /// Checks that a client with `chain` would be accepted now. A certificate may have expired since the handshake, and
+    /// newer material may have other roots and lists.
     ///
-    /// Its signature is not checked: that was the handshake's.
+    /// It does not check the client's signature, which the handshake verified.
     pub fn accepts_client(&self, chain: &[CertificateDer<'_>]) -> Result<(), Error> {
         self.accepts(chain, Role::Client)
     }
 
-    /// The same of a server, whose name is not checked.
+    /// As [`CaMaterial::accepts_client()`], for a server. The server's name is not checked.
     pub fn accepts_server(&self, chain: &[CertificateDer<'_>]) -> Result<(), Error> {
         self.accepts(chain, Role::Nameless)
     }
 
-    /// Whether somebody with these roots and lists would accept us now, in both roles.
+    /// Checks that a peer with the same roots and lists would accept this end now, in both roles.
     pub fn accepts_us(&self) -> Result<(), Error> {
         self.accepts_client(&self.ours.cert).and_then(|()| self.accepts_server(&self.ours.cert))
     }

@@ -1,4 +1,4 @@
-//! Our own key.
+//! The key of this end.
 
 use std::sync::Arc;
 
@@ -16,43 +16,44 @@ use zeroize::Zeroizing;
 use super::{SpkiDigest, pem};
 use crate::Error;
 
-/// What a key that is made here signs with.
+/// The signature algorithm of a new key.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum KeyAlgorithm {
-    /// ML-DSA-65 (FIPS 204), which a quantum computer does not forge.
+    /// ML-DSA-65 (FIPS 204). A quantum computer cannot forge its signatures.
     #[default]
     MlDsa65,
-    /// Ed25519 (RFC 8032), small and classical.
+    /// Ed25519 (RFC 8032). It is small and classical.
     Ed25519,
 }
 
-/// A private key that signs handshakes, shown to the peer as a raw public key.
+/// A private key that signs handshakes. The peer receives it as a raw public key.
 ///
-/// ML-DSA-65 if it is made here; any that rustls can sign with if it is read (Ed25519, ECDSA,
-/// RSA-PSS). Not printable. Clones share one key.
+/// A generated key is for ML-DSA-65, or for the algorithm in [`SigningKey::generate_pem_with()`]. A
+/// key that is read may be for any algorithm with which rustls can sign (also ECDSA and RSA-PSS).
+/// It cannot be printed. Clones share one key.
 #[derive(Clone)]
 pub struct SigningKey {
     certified: Arc<CertifiedKey>,
 }
 
 impl SigningKey {
-    /// Makes a new ML-DSA-65 key.
+    /// Generates an ML-DSA-65 key.
     pub fn generate() -> Result<Self, Error> {
         let pkcs8 = generate_pkcs8(KeyAlgorithm::MlDsa65)?;
         Self::from_pkcs8(&pkcs8)
     }
 
-    /// Makes a new ML-DSA-65 key as a PEM file, to be read with [`SigningKey::from_pem()`].
+    /// Generates an ML-DSA-65 key as a PEM text, which [`SigningKey::from_pem()`] can read.
     pub fn generate_pem() -> Result<Zeroizing<String>, Error> {
         Self::generate_pem_with(KeyAlgorithm::MlDsa65)
     }
 
-    /// The same with an algorithm of choice.
+    /// As [`SigningKey::generate_pem()`], with the given algorithm.
     pub fn generate_pem_with(algorithm: KeyAlgorithm) -> Result<Zeroizing<String>, Error> {
         let pkcs8 = generate_pkcs8(algorithm)?;
         let body = Zeroizing::new(STANDARD.encode(&*pkcs8));
-        // room for every line end, so that the text is never moved and left behind
+        // the capacity includes all line ends, so that the text is never moved and leaves no copy
         let mut pem = Zeroizing::new(String::with_capacity(body.len() + body.len() / 64 + 80));
         pem.push_str("-----BEGIN PRIVATE KEY-----\n");
         for at in (0..body.len()).step_by(64) {
@@ -68,12 +69,12 @@ impl SigningKey {
         Self::load(&PrivateKeyDer::Pkcs8(PrivatePkcs8KeyDer::from(der)))
     }
 
-    /// Reads a PKCS#8 key in PEM: the first `PRIVATE KEY` in `text`.
+    /// Reads the first `PRIVATE KEY` in `text`, a PKCS#8 key in PEM.
     pub fn from_pem(text: &str) -> Result<Self, Error> {
         Self::from_pkcs8(&pem::private_key(text)?)
     }
 
-    /// The digest by which a peer pins this key.
+    /// Returns the digest by which a peer pins this key.
     pub fn spki_digest(&self) -> SpkiDigest {
         SpkiDigest::of(&self.certified.cert[0])
     }
@@ -97,8 +98,8 @@ impl SigningKey {
     }
 }
 
-/// Parses a key from where it lies: rustls's key provider asks for a copy of its own, which it does
-/// not erase.
+/// Parses a key from borrowed bytes. rustls's key provider would require its own copy, which it
+/// does not erase.
 pub(super) fn signing_key(
     der: &PrivateKeyDer<'_>,
 ) -> Result<Arc<dyn rustls::sign::SigningKey>, Error> {

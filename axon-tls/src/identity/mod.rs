@@ -1,8 +1,9 @@
-//! Who the peer of a hybrid connection is.
+//! Authentication of the peer of a hybrid connection.
 //!
-//! The key exchange keeps a recording adversary out; only authentication keeps an active one out.
-//! [`Auth`] says which of them a configuration does, and is never implied. It is mutual in every
-//! case, and the peer has to prove in every case that it has the private key it shows.
+//! The key exchange protects against an adversary that records traffic. Only authentication
+//! protects against an active one. [`Auth`] selects the protection of a configuration, and there is
+//! no default. Authentication is mutual in every case. In every case the peer has to prove that it
+//! has the private key of what it shows.
 
 mod ca;
 mod key;
@@ -36,23 +37,23 @@ use crate::Error;
 #[derive(Clone)]
 #[non_exhaustive]
 pub enum Auth {
-    /// Not at all: any peer is accepted, under the ephemeral raw public key that it shows.
+    /// No authentication. Any peer is accepted with the ephemeral raw public key that it shows.
     ///
     /// **This protects against eavesdroppers, not against a man in the middle.**
     None(SigningKey),
-    /// Raw public keys (RFC 7250) that both ends know beforehand.
+    /// Raw public keys (RFC 7250) that both ends know in advance.
     Pinned {
-        /// Our key, which the peer has pinned.
+        /// The key of this end, which the peer has pinned.
         key: SigningKey,
         /// The keys of the peers.
         trust: Trust,
     },
-    /// Certificates from given roots alone, on both ends. There are no public roots.
+    /// Certificates from the given roots only, on both ends. Public roots are not accepted.
     Ca(Arc<CaMaterial>),
 }
 
 impl Auth {
-    /// The name used in configuration: `none`, `pinned` or `ca`.
+    /// Returns the name used in configuration: `none`, `pinned` or `ca`.
     pub fn name(&self) -> &'static str {
         match self {
             Self::None(_) => "none",

@@ -1,4 +1,4 @@
-//! A private key out of its PEM text, leaving no copy of it behind.
+//! Reads a private key from its PEM text, and leaves no copy of it in memory.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
@@ -9,9 +9,10 @@ use crate::Error;
 const BEGIN: &str = "-----BEGIN PRIVATE KEY-----";
 const END: &str = "-----END PRIVATE KEY-----";
 
-/// The DER of the first `PRIVATE KEY` (PKCS#8).
+/// Returns the DER of the first `PRIVATE KEY` (PKCS#8).
 ///
-/// Both buffers have their size from the start: one that grows leaves what it held behind.
+/// Both buffers have their full size from the start, because a buffer that grows leaves its former
+/// contents in memory.
 pub(super) fn private_key(text: &str) -> Result<Zeroizing<Vec<u8>>, Error> {
     let section = || {
         let (_, from) = text.split_once(BEGIN)?;
@@ -30,7 +31,7 @@ pub(super) fn private_key(text: &str) -> Result<Zeroizing<Vec<u8>>, Error> {
     Ok(der)
 }
 
-/// What stands there in place of a PKCS#8 key.
+/// Describes what the text contains instead of a PKCS#8 key.
 fn missing(text: &str) -> &'static str {
     const OTHERS: [(&str, &str); 5] = [
         (

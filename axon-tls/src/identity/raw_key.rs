@@ -1,4 +1,4 @@
-//! Checking the raw public key of a peer (RFC 7250).
+//! Verifies the raw public key of a peer (RFC 7250).
 
 use std::time::SystemTime;
 
@@ -12,8 +12,8 @@ use super::refused::Refused;
 use super::verifier::{Peers, Role};
 use super::{SpkiDigest, Trust};
 
-/// Accepts a raw public key that is pinned, or any if there are no pins to go by; and in both
-/// cases only with its signature of the handshake.
+/// Accepts a raw public key that is pinned, or any key if there are no pins. In both cases the peer
+/// must have signed the handshake with it.
 #[derive(Debug)]
 pub(super) struct RawKeys {
     trust: Option<Trust>,

@@ -1,4 +1,4 @@
-//! Refusals that rustls has no words for.
+//! Reasons for refusals that rustls's own errors do not express.
 
 use std::fmt;
 use std::sync::Arc;
@@ -7,17 +7,17 @@ use rustls::pki_types::CertificateDer;
 use rustls::{CertificateError, Error, OtherError};
 use webpki::EndEntityCert;
 
-/// Why a peer, or what this host is to show, is refused.
+/// The reason why a peer, or this host's own certificate, is refused.
 #[derive(Clone, PartialEq, Eq)]
 pub(super) enum Refused {
-    /// A certificate of X.509 version 1: it has no extensions, and so names no host.
+    /// A certificate of X.509 version 1 or 2. It has no extensions, and therefore names no host.
     OldVersion,
-    /// A pin that held up to this day. The trust file's name for the peer stays here: who is refused
-    /// is told the reason.
+    /// A pin that was valid until this day. The reason is sent to the refused peer, so it does not contain the trust
+    /// file's name for that peer.
     PinEnded(String),
 }
 
-/// Whether this is an X.509 certificate of version 1 or 2.
+/// Returns whether this is an X.509 certificate of version 1 or 2.
 pub(super) fn is_of_old_version(certificate: &CertificateDer<'_>) -> bool {
     matches!(EndEntityCert::try_from(certificate), Err(webpki::Error::UnsupportedCertVersion))
 }
@@ -38,7 +38,7 @@ impl fmt::Display for Refused {
     }
 }
 
-/// rustls shows what is no error of its own by `Debug`.
+/// rustls formats an error that is not its own with `Debug`.
 impl fmt::Debug for Refused {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         fmt::Display::fmt(self, f)

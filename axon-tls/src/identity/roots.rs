@@ -1,5 +1,5 @@
-//! Checking the certificate of a peer: from given roots, in date, not revoked, for its role; and
-//! whether it is for the host that the peer says it is.
+//! Verifies the certificate of a peer: it must come from given roots, be in date, not be revoked, and permit the peer's
+//! role. Also checks whether it is for the host name that the peer uses.
 
 use std::sync::Arc;
 
@@ -19,14 +19,14 @@ use super::verifier::{Peers, Role};
 
 /// Accepts certificates from given roots.
 ///
-/// With a revocation list, every issuer in the chain needs one that is in date: an old list says
-/// nothing about what was revoked since.
+/// If there are revocation lists, every issuer in the chain needs one that is in date. An old list does not tell which
+/// certificates were revoked later.
 #[derive(Debug)]
 pub(super) struct FromRoots {
     pub(super) roots: Arc<RootCertStore>,
     pub(super) crls: Arc<Vec<CertRevocationList<'static>>>,
     pub(super) algorithms: WebPkiSupportedAlgorithms,
-    /// Whether a client leaves the server's name to the application.
+    /// Whether a client leaves the check of the server's name to the application.
     pub(super) names_checked_later: bool,
 }
 
@@ -42,7 +42,7 @@ impl Peers for FromRoots {
     ) -> Result<(), Error> {
         let certificate = EndEntityCert::try_from(shown).map_err(refusal)?;
         let crls: Vec<_> = self.crls.iter().collect();
-        // no lists were given: nothing to check against
+        // without revocation lists there is nothing to check
         let revocation = RevocationOptionsBuilder::new(&crls)
             .ok()
             .map(|options| options.with_expiration_policy(ExpirationPolicy::Enforce).build());
@@ -78,15 +78,15 @@ impl Peers for FromRoots {
 }
 
 impl FromRoots {
-    /// Of several lists of one issuer, webpki asks the first that covers a certificate, which may be
-    /// the oldest. Here each is asked, about every certificate that was shown.
+    /// Checks that no list has revoked any certificate that was shown. If an issuer has several lists, webpki uses the
+    /// first that covers a certificate, which may be the oldest. This function uses all of them.
     fn revoked_nowhere(
         &self,
         shown: &CertificateDer<'_>,
         others: &[CertificateDer<'_>],
     ) -> Result<(), Error> {
         for certificate in std::iter::once(shown).chain(others) {
-            // One that is none is in no chain either.
+            // Bytes that are not a certificate are not part of the verified chain.
             let Ok(certificate) = EndEntityCert::try_from(certificate) else { continue };
             for list in self.crls.iter().filter(|list| list.issuer() == certificate.issuer()) {
                 if list.find_serial(certificate.serial()).map_err(refusal)?.is_some() {
@@ -98,8 +98,8 @@ impl FromRoots {
     }
 }
 
-/// Whether the certificate names exactly this host: a DNS name, in whatever case, and no wildcard,
-/// by which each of many hosts could be all of them.
+/// Returns whether the certificate names exactly this host by a DNS name, in upper or lower case. A wildcard does not
+/// count, because it would let each of many hosts use all their names.
 pub(super) fn is_for_host(certificate: &CertificateDer<'_>, host: &str) -> bool {
     let (Ok(certificate), Ok(name)) =
         (EndEntityCert::try_from(certificate), DnsName::try_from(host))
@@ -110,13 +110,13 @@ pub(super) fn is_for_host(certificate: &CertificateDer<'_>, host: &str) -> bool 
         && certificate.valid_dns_names().any(|dns| dns.eq_ignore_ascii_case(host))
 }
 
-/// The DNS names of the certificate that are no wildcards.
+/// Returns the DNS names of the certificate, except wildcards.
 pub(super) fn host_names(certificate: &CertificateDer<'_>) -> Vec<String> {
     let Ok(certificate) = EndEntityCert::try_from(certificate) else { return Vec::new() };
     certificate.valid_dns_names().filter(|n| !n.contains('*')).map(str::to_owned).collect()
 }
 
-/// In rustls's words where it has them, for the alert that the peer is sent.
+/// Maps an error to rustls's own errors where it has one, because this decides the alert that the peer receives.
 fn refusal(error: webpki::Error) -> Error {
     match error {
         webpki::Error::InvalidCrlSignatureForPublicKey => {

@@ -1,4 +1,4 @@
-//! Looking at the identity that a server shows, without trusting it.
+//! Reads the identity that a server shows, without trusting it.
 
 use std::sync::{Arc, OnceLock};
 
@@ -19,14 +19,14 @@ use super::verifier::{Peers, Role, Verifier};
 use crate::hybrid::provider;
 use crate::negotiated::protocols;
 
-/// A client that looks at a server's key and then breaks off.
+/// A client that reads a server's key and then ends the handshake.
 ///
-/// Its handshake fails always, at the latest when the server has signed it: no data can be sent or
-/// received, and the server sees the alert `access_denied`. What the server has shown is in
-/// [`Probe::shown()`] then, provided that the server holds the private key. **Whose key it is,
-/// nobody has checked**: compare it with what is known of that host from elsewhere.
+/// Its handshake always fails, at the latest after the server has signed it. No data can be sent or received, and the
+/// server receives the alert `access_denied`. [`Probe::shown()`] then returns what the server has shown, provided that
+/// the server has the private key. **No one has verified the owner of the key**: compare it with a copy of that host's
+/// key from another source.
 ///
-/// For one connection; make another one for the next.
+/// A probe is for one connection.
 ///
 /// ```
 /// # use axon_tls::{Error, identity::Probe};
@@ -45,39 +45,40 @@ pub struct Probe {
     shown: Arc<OnceLock<Shown>>,
 }
 
-/// What a server has shown and signed the handshake with.
+/// The key or certificate with which a server signed the handshake.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Shown {
     /// The digest of its public key.
     pub key: SpkiDigest,
-    /// How it signed.
+    /// The signature scheme.
     pub scheme: SignatureScheme,
-    /// The DNS names of its certificate, as the certificate has them; `None` for a raw public key.
+    /// The DNS names of its certificate, as written there. `None` for a raw public key.
     pub certificate_names: Option<Vec<String>>,
 }
 
 impl Probe {
-    /// Looks for a raw public key (RFC 7250), as [`Auth::Pinned`](super::Auth::Pinned) and [`Auth::None`](super::Auth::None) show it.
+    /// Creates a probe for a raw public key (RFC 7250), as [`Auth::Pinned`](super::Auth::Pinned) and
+    /// [`Auth::None`](super::Auth::None) show it.
     ///
     /// A server with certificates answers with the alert `handshake_failure`.
     pub fn for_raw_key(alpn: &[u8]) -> Result<Self, crate::Error> {
         Self::new::<true>(alpn)
     }
 
-    /// Looks for a certificate, as [`Auth::Ca`](super::Auth::Ca) shows it.
+    /// Creates a probe for a certificate, as [`Auth::Ca`](super::Auth::Ca) shows it.
     ///
     /// A server with a raw public key answers with the alert `handshake_failure`.
     pub fn for_certificate(alpn: &[u8]) -> Result<Self, crate::Error> {
         Self::new::<false>(alpn)
     }
 
-    /// The configuration to connect with: the hybrid key exchange, both cipher suites.
+    /// Returns the configuration to connect with. It has the hybrid key exchange and both cipher suites.
     pub fn client_config(&self) -> Arc<ClientConfig> {
         Arc::clone(&self.config)
     }
 
-    /// What the server has shown, once it has signed the handshake with it.
+    /// Returns what the server has shown, after it has signed the handshake with it.
     pub fn shown(&self) -> Option<&Shown> {
         self.shown.get()
     }
@@ -109,7 +110,7 @@ struct ScanVerifier<const RAW_KEYS: bool> {
 impl<const RAW_KEYS: bool> Peers for ScanVerifier<RAW_KEYS> {
     const RAW_KEYS: bool = RAW_KEYS;
 
-    /// rustls asks this first and for the signature next, which is where it ends.
+    /// Accepts any identity. rustls calls this before it verifies the signature, where the handshake ends.
     fn accept(
         &self,
         _shown: &CertificateDer<'_>,
@@ -120,7 +121,7 @@ impl<const RAW_KEYS: bool> Peers for ScanVerifier<RAW_KEYS> {
         Ok(())
     }
 
-    /// Never `Ok`.
+    /// Records the identity if the signature is valid. Always returns an error.
     fn signed(
         &self,
         message: &[u8],
@@ -146,8 +147,8 @@ impl<const RAW_KEYS: bool> Peers for ScanVerifier<RAW_KEYS> {
     }
 }
 
-/// A client without a key. Which kind it would have must be said nevertheless: a server that wants
-/// raw public keys refuses one that does not.
+/// A client without a key. It must still state the kind of its key, because a server with raw public keys refuses a
+/// client that does not support them.
 #[derive(Debug)]
 struct Nobody<const RAW_KEYS: bool>;
 
@@ -180,8 +181,8 @@ mod tests {
 
     const ALPN: &[u8] = b"axon/1";
 
-    /// Lets them talk until they have no more to say. Fails if either completes the handshake or
-    /// any of the data that the client wants to send arrives; why each gave up.
+    /// Runs a handshake until both ends have nothing more to send. Panics if an end completes the handshake, or if any
+    /// of the client's data arrives. Returns the errors of both ends.
     fn meet(probe: &Probe, server: ServerConfig) -> (Option<Error>, Option<Error>) {
         let name = "peer".try_into().unwrap();
         let mut client = ClientConnection::new(probe.client_config(), name).unwrap();

@@ -1,4 +1,4 @@
-//! The digest that names a public key.
+//! The digest that identifies a public key.
 
 use std::fmt;
 use std::str::FromStr;
@@ -8,21 +8,22 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use rustls::pki_types::CertificateDer;
 
-/// SHA-256 of a public key, as its SubjectPublicKeyInfo in DER.
+/// The SHA-256 of a public key's SubjectPublicKeyInfo in DER.
 ///
-/// Written `spki-sha256:` and 44 characters of base64.
+/// Its text form is `spki-sha256:` and 44 characters of base64.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct SpkiDigest(pub [u8; 32]);
 
 impl SpkiDigest {
-    /// The digest of a SubjectPublicKeyInfo.
+    /// Returns the digest of a SubjectPublicKeyInfo.
     pub fn of(spki: &[u8]) -> Self {
         let mut bytes = [0; 32];
         bytes.copy_from_slice(digest(&SHA256, spki).as_ref());
         Self(bytes)
     }
 
-    /// The digest of what rustls calls a peer's certificate: a certificate or a raw public key.
+    /// Returns the digest of the key in what rustls calls a peer's certificate, which is a
+    /// certificate or a raw public key.
     pub(crate) fn of_peer(shown: &CertificateDer<'_>) -> Option<Self> {
         match rustls::server::ParsedCertificate::try_from(shown) {
             Ok(certificate) => Some(Self::of(&certificate.subject_public_key_info())),

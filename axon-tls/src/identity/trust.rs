@@ -1,4 +1,4 @@
-//! The keys of the peers: a file of pins, and the set in use, which can be replaced.
+//! The keys of the peers: a file of pins, and the set of pins in use, which can be replaced.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::{Arc, PoisonError, RwLock};
@@ -8,8 +8,9 @@ use super::SpkiDigest;
 
 /// A parsed trust file.
 ///
-/// A line a key: a name, its digest and, if it ends, the last day it is valid on (UTC). A name may
-/// have two keys, for the time when a peer changes from one to the other. `#` begins a comment.
+/// Each line has a key: a name, the key's digest and, optionally, the last day on which the key is
+/// valid (UTC). A name may have two keys, for the time when a peer changes from one to the other.
+/// `#` begins a comment.
 ///
 /// ```
 /// # use axon_tls::identity::TrustFile;
@@ -26,7 +27,7 @@ pub struct TrustFile {
     pins: BTreeMap<SpkiDigest, Pin>,
 }
 
-/// A line of a trust file: a peer's name, its key, and until when the key is trusted.
+/// A line of a trust file: a peer's name, its key, and the last day on which the key is trusted.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Pin {
     name: String,
@@ -36,22 +37,22 @@ pub struct Pin {
 }
 
 impl Pin {
-    /// Whose key it is.
+    /// Returns the name of the key's owner.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// The key.
+    /// Returns the key.
     pub fn key(&self) -> SpkiDigest {
         self.key
     }
 
-    /// The last day on which the pin holds (UTC), as `YYYY-MM-DD`.
+    /// Returns the last day on which the pin is valid (UTC), as `YYYY-MM-DD`.
     pub fn last_day(&self) -> Option<&str> {
         self.last.as_ref().map(|(day, _)| day.as_str())
     }
 
-    /// Whether the pin holds at `now`.
+    /// Returns whether the pin is valid at `now`.
     pub fn holds(&self, now: SystemTime) -> bool {
         self.last.as_ref().is_none_or(|(_, end)| now < *end)
     }
@@ -66,19 +67,19 @@ pub struct TrustFileError {
 }
 
 impl TrustFileError {
-    /// The line, counted from 1.
+    /// Returns the number of the line, counted from 1.
     pub fn line(&self) -> usize {
         self.line
     }
 
-    /// What is wrong with it.
+    /// Returns the reason.
     pub fn reason(&self) -> &'static str {
         self.reason
     }
 }
 
 impl TrustFile {
-    /// The most keys of one name.
+    /// The most keys that one name may have.
     pub const MAX_PINS_PER_NAME: usize = 2;
     /// The largest file, in bytes.
     pub const MAX_LEN: usize = 1 << 20;
@@ -105,18 +106,18 @@ impl TrustFile {
         Ok(file)
     }
 
-    /// The name that has the key, if it is valid at `now`.
+    /// Returns the name that has the key, if the key is valid at `now`.
     pub fn name_of(&self, key: &SpkiDigest, now: SystemTime) -> Option<&str> {
         let pin = self.pins.get(key)?;
         pin.holds(now).then_some(pin.name.as_str())
     }
 
-    /// The pin of the key, whether it still [holds](Pin::holds) or not.
+    /// Returns the pin of the key, even if it no longer [holds](Pin::holds).
     pub fn pin_of(&self, key: &SpkiDigest) -> Option<&Pin> {
         self.pins.get(key)
     }
 
-    /// Every key with its name, those of one name together, the one that ends first in front.
+    /// Returns every pin, grouped by name. Within a name, the pin that ends first comes first.
     pub fn pins(&self) -> impl Iterator<Item = &Pin> {
         let mut pins: Vec<_> = self.pins.values().collect();
         let end = |pin: &Pin| pin.last.as_ref().map(|(_, end)| *end);
@@ -124,7 +125,7 @@ impl TrustFile {
         pins.into_iter()
     }
 
-    /// Every name, sorted, once.
+    /// Returns every name once, in sorted order.
     pub fn names(&self) -> impl Iterator<Item = &str> {
         let mut names: Vec<_> = self.pins.values().map(|pin| pin.name.as_str()).collect();
         names.sort_unstable();
@@ -132,16 +133,16 @@ impl TrustFile {
         names.into_iter()
     }
 
-    /// Whether there is no key at all.
+    /// Returns whether there is no key.
     pub fn is_empty(&self) -> bool {
         self.pins.is_empty()
     }
 }
 
-/// The pin in a line, if it is not empty or a comment.
+/// Parses a line. Returns `None` if it is empty or a comment.
 fn parse_line(line: &str) -> Result<Option<Pin>, &'static str> {
     let content = line.split('#').next().unwrap_or_default();
-    // One more than there may be, and no more than that of a line that goes on and on.
+    // Four fields are one more than a line may have. The limit bounds the work for an endless line.
     let fields: Vec<_> = content.split_ascii_whitespace().take(4).collect();
     let (name, digest, day) = match fields[..] {
         [] => return Ok(None),
@@ -164,7 +165,7 @@ fn parse_line(line: &str) -> Result<Option<Pin>, &'static str> {
     Ok(Some(Pin { name: name.to_owned(), key, last }))
 }
 
-/// The moment after the last of a day in UTC, for years 1970 to 9999.
+/// Returns the moment after the end of a day in UTC, for years 1970 to 9999.
 fn end_of_day(day: &str) -> Option<SystemTime> {
     let bytes = day.as_bytes();
     if bytes.len() != 10 || bytes[4] != b'-' || bytes[7] != b'-' {
@@ -191,31 +192,31 @@ fn end_of_day(day: &str) -> Option<SystemTime> {
 
 /// The set of pins that connections are checked against. Clones share one set.
 ///
-/// Replacing it affects handshakes from then on. Connections that stand are for their owner to
-/// close: [`Trust::name_of()`] tells which.
+/// A replaced set applies to later handshakes. The owner of existing connections has to close those
+/// that are no longer trusted: [`Trust::name_of()`] identifies them.
 #[derive(Clone, Debug, Default)]
 pub struct Trust {
     file: Arc<RwLock<TrustFile>>,
 }
 
 impl Trust {
-    /// Starts with the pins of `file`.
+    /// Creates a set with the pins of `file`.
     pub fn new(file: TrustFile) -> Self {
         Self { file: Arc::new(RwLock::new(file)) }
     }
 
-    /// Goes on with the pins of `file` instead.
+    /// Replaces the pins with those of `file`.
     pub fn replace(&self, file: TrustFile) {
         *self.file.write().unwrap_or_else(PoisonError::into_inner) = file;
     }
 
-    /// The name that has the key now.
+    /// Returns the name that has the key now.
     pub fn name_of(&self, key: &SpkiDigest) -> Option<String> {
         let file = self.file.read().unwrap_or_else(PoisonError::into_inner);
         file.name_of(key, SystemTime::now()).map(str::to_owned)
     }
 
-    /// The pin of the key, whether it still [holds](Pin::holds) or not.
+    /// Returns the pin of the key, even if it no longer [holds](Pin::holds).
     pub fn pin_of(&self, key: &SpkiDigest) -> Option<Pin> {
         let file = self.file.read().unwrap_or_else(PoisonError::into_inner);
         file.pin_of(key).cloned()

@@ -1,5 +1,5 @@
-//! One verifier for both ends: rustls asks about servers and clients by two traits that say the
-//! same, and who is accepted must not depend on which end asks.
+//! One verifier for both ends. rustls has separate traits for servers and clients with the same
+//! questions. The decision must not depend on which end asks.
 
 use std::fmt::Debug;
 
@@ -8,22 +8,22 @@ use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
 use rustls::server::danger::{ClientCertVerified, ClientCertVerifier};
 use rustls::{DigitallySignedStruct, DistinguishedName, Error, PeerIncompatible, SignatureScheme};
 
-/// What the peer is, to whom it shows itself.
+/// The role of the peer that is verified.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Role<'a> {
     Client,
-    /// By the name that the client connects with.
+    /// A server, with the name to which the client connects.
     Server(&'a ServerName<'a>),
-    /// A server whose name is left to others.
+    /// A server whose name is checked elsewhere.
     Nameless,
 }
 
-/// Whom to accept.
+/// The decision which peers to accept.
 pub(super) trait Peers: Debug + Send + Sync {
     /// Whether peers show raw public keys (RFC 7250) and no certificates.
     const RAW_KEYS: bool;
 
-    /// Whether the peer that shows this is accepted.
+    /// Returns an error unless the peer's certificate or key is accepted.
     fn accept(
         &self,
         shown: &CertificateDer<'_>,
@@ -32,7 +32,7 @@ pub(super) trait Peers: Debug + Send + Sync {
         now: UnixTime,
     ) -> Result<(), Error>;
 
-    /// Whether the peer has the private key of what it shows.
+    /// Verifies that the peer has the private key of what it shows.
     fn signed(
         &self,
         message: &[u8],
@@ -40,15 +40,15 @@ pub(super) trait Peers: Debug + Send + Sync {
         signature: &DigitallySignedStruct,
     ) -> Result<HandshakeSignatureValid, Error>;
 
-    /// The signatures that [`Peers::signed()`] can check.
+    /// Returns the signature schemes that [`Peers::signed()`] can verify.
     fn schemes(&self) -> Vec<SignatureScheme>;
 }
 
-/// Both traits of rustls.
+/// Implements both traits of rustls.
 #[derive(Debug)]
 pub(super) struct Verifier<P>(pub(super) P);
 
-/// TLS 1.2 is not offered, so there is no signature of it to check.
+/// TLS 1.2 is not offered, so it has no signature to verify.
 fn no_tls12() -> Result<HandshakeSignatureValid, Error> {
     Err(Error::PeerIncompatible(PeerIncompatible::Tls12NotOfferedOrEnabled))
 }
@@ -93,7 +93,7 @@ impl<P: Peers> ServerCertVerifier for Verifier<P> {
     }
 }
 
-// `client_auth_mandatory()` is rustls's default here: true.
+// rustls's default for `client_auth_mandatory()` is true, which is needed here.
 impl<P: Peers> ClientCertVerifier for Verifier<P> {
     fn root_hint_subjects(&self) -> &[DistinguishedName] {
         &[]

@@ -1,4 +1,4 @@
-//! Configurations of rustls-axon for a pre-shared key, and what became of a connection.
+//! Configurations of rustls-axon for a pre-shared key, and the result of a connection.
 
 use std::collections::HashSet;
 use std::fmt::{self, Debug};
@@ -16,38 +16,37 @@ use super::Psk;
 use crate::negotiated::protocols;
 use crate::{Cipher, Error, KeyExchange, Negotiated, PskKex};
 
-/// Where a server looks up pre-shared keys.
+/// The source of a server's pre-shared keys.
 ///
-/// Called on the thread that handles the packet: an implementation must not block. Looking a key
-/// up must not spend it, because anybody can send an identity that they saw on the wire: it is
-/// spent when [`negotiated()`] of the connection is `Some`.
+/// It is called on the thread that handles the packet, so an implementation must not block. A look-up must not consume
+/// the key, because anyone can send an identity that they saw on the wire. The key is consumed when [`negotiated()`] of
+/// the connection is `Some`.
 pub trait PskResolver: Debug + Send + Sync {
-    /// The key with exactly this identity; `None` refuses the client with the alert
-    /// `unknown_psk_identity`.
+    /// Returns the key with exactly this identity. `None` refuses the client with the alert `unknown_psk_identity`.
     ///
-    /// These are bytes from the network. Those of a QKD key are for
+    /// The identity comes from the network. For the identity of a QKD key, use
     /// [`PskIdentity::parse()`](crate::qkd::PskIdentity::parse).
     fn resolve(&self, identity: &[u8]) -> Option<Arc<Psk>>;
 
-    /// The same without any effect: a resolver that begins to fetch a key it has not must not do so
-    /// here.
+    /// As [`resolve()`](Self::resolve), without side effects. A resolver that fetches keys which it does not have must
+    /// not start a fetch here.
     ///
-    /// Where a client offers several identities, this is called for each of the first eight, in the
-    /// client's order, until one is known that was derived for the configured cipher and is not
-    /// erased. If none is, [`resolve()`](Self::resolve) is called for the first one.
+    /// If a client offers several identities, this is called for each of the first eight, in the client's order, until
+    /// one has a key that was derived for the configured cipher and is not erased. If none has,
+    /// [`resolve()`](Self::resolve) is called for the first identity.
     fn resolve_known(&self, identity: &[u8]) -> Option<Arc<Psk>> {
         self.resolve(identity)
     }
 }
 
-/// A client's configuration that offers `psks`, most preferred first, with one ALPN protocol, or none if
-/// `alpn` is empty. The cipher is the one that the keys are for.
+/// Makes a client's configuration that offers `psks`, most preferred first. It has one ALPN protocol, or none if `alpn`
+/// is empty. The cipher is the one that the keys are for.
 ///
 /// No server name is sent. A server of this crate looks up the first eight identities.
 ///
 /// # Errors
-/// [`Error::Psk`] if there is no key, if two have the same identity, if they are for different ciphers,
-/// or if their identities together do not fit into a ClientHello (about 60,000 bytes).
+/// [`Error::Psk`] if there is no key, if two have the same identity, if they are for different ciphers, or if their
+/// identities together do not fit into a ClientHello (about 60,000 bytes).
 pub fn client_config(psks: Vec<Arc<Psk>>, kex: PskKex, alpn: &[u8]) -> Result<ClientConfig, Error> {
     let cipher = psks.first().ok_or(Error::Psk("there is none to offer"))?.cipher();
     client_config_with(provider(cipher, kex), psks, kex, alpn)
@@ -67,7 +66,7 @@ pub(crate) fn client_config_with(
     Ok(config)
 }
 
-/// What would otherwise fail as late as a connection is made, and over quinn without a reason.
+/// Checks the keys now. A bad key would otherwise fail only when a connection is made, and over quinn without a reason.
 fn check_offer(psks: &[Arc<Psk>]) -> Result<(), Error> {
     let (mut identities, mut len) = (HashSet::new(), 0);
     for psk in psks {
@@ -85,7 +84,7 @@ fn check_offer(psks: &[Arc<Psk>]) -> Result<(), Error> {
     Ok(())
 }
 
-/// A server's configuration, with one ALPN protocol, or none if `alpn` is empty.
+/// Makes a server's configuration with one ALPN protocol, or none if `alpn` is empty.
 ///
 /// A key that the resolver returns is used only if it was derived for `cipher`.
 pub fn server_config(
@@ -111,10 +110,10 @@ pub(crate) fn server_config_with(
     Ok(config)
 }
 
-/// What a finished handshake agreed on; `None` while it is under way.
+/// Returns the result of a finished handshake. Returns `None` while the handshake is in progress.
 ///
-/// On a server it is finished when the client's Finished was verified, so that is when a key is
-/// spent.
+/// On a server the handshake is finished when the client's Finished has been verified. The key is consumed at that
+/// time.
 pub fn negotiated(conn: &CommonState) -> Option<Negotiated> {
     let psk = conn.external_psk()?;
     let agreed = conn.negotiated_cipher_suite()?.suite();
@@ -160,7 +159,7 @@ fn mode(kex: PskKex) -> PskKeyExchangeMode {
     }
 }
 
-/// A client's keys. Once all are erased, connecting fails: there is nothing to offer.
+/// The keys that a client offers. If all are erased, connecting fails, because there is nothing to offer.
 struct Offer(Vec<Arc<Psk>>);
 
 impl ExternalPskSource for Offer {
@@ -176,7 +175,7 @@ impl Debug for Offer {
     }
 }
 
-/// Takes the first offered identity that is known and goes with the configured cipher.
+/// Selects the first offered identity whose key is known and is for the configured cipher.
 struct FirstKnown {
     resolver: Arc<dyn PskResolver>,
     cipher: Cipher,
@@ -192,7 +191,7 @@ impl ResolvesExternalPsk for FirstKnown {
             (psk.identity() == *identity && usable).then_some(psk)
         };
 
-        // A key at hand under a later identity must not cost a fetch of the first one.
+        // If a later identity has a key at hand, the first identity's key must not be fetched.
         let known = if others.is_empty() { None } else { identities.iter().find_map(at_hand) };
         known
             .or_else(|| self.resolver.resolve(first).filter(|psk| psk.identity() == *first))
@@ -206,13 +205,14 @@ impl Debug for FirstKnown {
     }
 }
 
-/// How many identities of one ClientHello are looked up.
+/// The most identities of one ClientHello that are looked up.
 ///
-/// A ClientHello has room for more than a thousand, and every client can send one.
+/// A ClientHello has room for more than a thousand, and every client can send that many.
 const MAX_LOOKED_UP: usize = 8;
 
-/// What a ClientHello has room for beside its other extensions, of which the key share is the longest.
+/// The bytes of a ClientHello that remain beside its other extensions, of which the key share is the longest.
 const MAX_OFFER: usize = 60_000;
 
-/// A length and an obfuscated ticket age for each identity, and a binder with its length.
+/// The bytes of an offer besides the identity: the identity's length, an obfuscated ticket age, and a binder with its
+/// length.
 const OFFER_OVERHEAD: usize = 2 + 4 + 1 + 48;

@@ -9,12 +9,12 @@ use zeroize::Zeroizing;
 
 use crate::{Cipher, Error};
 
-/// A pre-shared key, and the identity it is named by.
+/// A pre-shared key and its identity.
 ///
-/// Zeroized on drop; neither `Clone` nor `Debug`. Share it with an [`Arc`].
+/// It is zeroized on drop, and is neither `Clone` nor `Debug`. Share it with an [`Arc`].
 ///
-/// A connection keeps its configuration until it ends, and that keeps the key: [`erase`](Self::erase)
-/// a key for one connection when the handshake is complete.
+/// A connection keeps its configuration, and thus the key, until it ends. For a key of one connection, call
+/// [`erase`](Self::erase) when the handshake is complete.
 pub struct Psk {
     identity: Vec<u8>,
     psk: Mutex<Option<Arc<ExternalPsk>>>,
@@ -22,16 +22,16 @@ pub struct Psk {
 }
 
 impl Psk {
-    /// A key from `secret`, for connections with `cipher`. A `Vec<u8>` becomes such a secret by `into()`; one with
-    /// more capacity than bytes may be moved for that, and what it leaves behind is not erased.
+    /// Makes a key from `secret`, for connections with `cipher`. `into()` converts a `Vec<u8>` to such a secret. A
+    /// vector with more capacity than bytes may be moved for that, and the bytes that it leaves behind are not erased.
     ///
-    /// Both ends configure the same identity, secret and cipher: TLS ties a pre-shared key to the hash
-    /// of one cipher suite (RFC 8446 section 4.2.11). See the [module](crate::psk#security) for what
-    /// makes a good secret and who may share it.
+    /// Both ends configure the same identity, secret and cipher: TLS ties a pre-shared key to the hash of one cipher
+    /// suite (RFC 8446 section 4.2.11). See the [module](crate::psk#security) for the properties of a good secret and
+    /// for who may share it.
     ///
     /// # Errors
-    /// [`Error::RustlsAxon`] if the identity is empty or has more than 65,529 bytes, or if the secret has
-    /// fewer than 16.
+    /// [`Error::RustlsAxon`] if the identity is empty or has more than 65,529 bytes, or if the secret has fewer than
+    /// 16.
     pub fn new(
         identity: impl Into<Vec<u8>>,
         secret: SecretSlice<u8>,
@@ -41,34 +41,34 @@ impl Psk {
         Ok(ExternalPsk::new(identity, secret, cipher.hash())?.into())
     }
 
-    /// The identity, as the client sends it.
+    /// Returns the identity, as the client sends it.
     pub fn identity(&self) -> &[u8] {
         &self.identity
     }
 
-    /// Erases the secret: no handshake begins with it from here on. One under way, which has it
-    /// already, goes on and erases it at its end.
+    /// Erases the secret. No handshake can begin with it after this. A handshake in progress that already has the
+    /// secret continues, and erases it when it ends.
     pub fn erase(&self) {
         self.psk.lock().unwrap_or_else(PoisonError::into_inner).take();
     }
 
-    /// Whether the secret was erased.
+    /// Returns whether the secret was erased.
     pub fn is_erased(&self) -> bool {
         self.psk.lock().unwrap_or_else(PoisonError::into_inner).is_none()
     }
 
-    /// The only cipher this key can be used with.
+    /// Returns the only cipher with which this key can be used.
     pub fn cipher(&self) -> Cipher {
         self.cipher
     }
 
-    /// The key as rustls takes it; `None` once it is erased.
+    /// Returns the key in the form that rustls takes. Returns `None` after the key was erased.
     pub(crate) fn external(&self) -> Option<Arc<ExternalPsk>> {
         self.psk.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 }
 
-/// The cipher is the one of the key's hash: AES-256-GCM goes with SHA-384, ChaCha20-Poly1305 with SHA-256.
+/// Chooses the cipher by the key's hash: AES-256-GCM for SHA-384, ChaCha20-Poly1305 for SHA-256.
 impl From<ExternalPsk> for Psk {
     fn from(psk: ExternalPsk) -> Self {
         let cipher = match psk.hash() {

@@ -1,9 +1,8 @@
-//! Connections on an external pre-shared key: any secret that both ends have, under any identity.
+//! Connections on an external pre-shared key: any secret that both ends have, with any identity.
 //!
-//! The key authenticates both ends (RFC 8446 section 2.2): there are no certificates, and a connection
-//! completes on one of the configured keys or fails. [`crate::qkd`] derives such keys from those of a
-//! quantum key distribution system; with [`Psk::new()`] they can come from anywhere, such as a
-//! provisioning step or a hardware token.
+//! The key authenticates both ends (RFC 8446 section 2.2). There are no certificates, and a connection completes on one
+//! of the configured keys or fails. [`crate::qkd`] derives such keys from those of a quantum key distribution system.
+//! With [`Psk::new()`] they can come from any source, for example a provisioning step or a hardware token.
 //!
 //! ```
 //! use std::sync::Arc;
@@ -28,21 +27,20 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 //!
-//! The same over QUIC is `quic::psk_client()` and `quic::psk_server()` with the feature `quic`, and over
-//! any byte stream of tokio the module `stream` with the feature `tokio`.
+//! For QUIC, use `quic::psk_client()` and `quic::psk_server()` with the feature `quic`. For any byte stream of tokio,
+//! use the module `stream` with the feature `tokio`.
 //!
 //! # Security
 //!
-//! - A key must have 128 bits of entropy at least: a password is open to an offline dictionary attack.
-//! - A key is for one client and one server, in these roles. If both ends accept each other's
-//!   connections on the same key, an attacker can reflect a handshake (Selfie, RFC 9257 section 4.1).
-//!   Give each direction a key of its own, as [`derive_psk()`](crate::qkd::derive_psk) does, or import the
-//!   key with a context that names the roles (RFC 9258,
+//! - A key must have at least 128 bits of entropy. A password is open to an offline dictionary attack.
+//! - A key is for one client and one server, in these roles. If both ends accept each other's connections on the same
+//!   key, an attacker can reflect a handshake (Selfie, RFC 9257 section 4.1). Give each direction its own key, as
+//!   [`derive_psk()`](crate::qkd::derive_psk) does, or import the key with a context that names the roles (RFC 9258,
 //!   [`ImportedPsk`](rustls_axon::external_psk::ImportedPsk)).
-//! - [`PskKex::PskKe`](crate::PskKex::PskKe) has no forward secrecy: use a key for one connection, or use
+//! - [`PskKex::PskKe`](crate::PskKex::PskKe) has no forward secrecy. Use a key for one connection, or use
 //!   [`PskKex::PskDheKe`](crate::PskKex::PskDheKe).
-//! - The identity is sent in the clear, and anybody who saw it can send it. A look-up therefore spends
-//!   nothing; a key is spent when [`negotiated()`] of the connection is `Some`.
+//! - The identity is sent in the clear, and anyone who saw it can send it. A look-up therefore consumes nothing. A key
+//!   is consumed when [`negotiated()`] of the connection is `Some`.
 
 pub(crate) mod config;
 mod key;

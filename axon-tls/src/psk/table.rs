@@ -10,15 +10,15 @@ use crate::Error;
 
 /// A [`PskResolver`] with a table of keys, which can change while the server runs.
 ///
-/// All methods can be called from any thread; none blocks longer than a look-up takes. A connection that
-/// was made on a key goes on when the key is removed.
+/// All methods can be called from any thread. None blocks for longer than a look-up. A connection that was made on a
+/// key continues when the key is removed.
 #[derive(Default)]
 pub struct PskTable {
     keys: RwLock<HashMap<Vec<u8>, Arc<Psk>>>,
 }
 
 impl PskTable {
-    /// A table of `psks`.
+    /// Makes a table of `psks`.
     ///
     /// # Errors
     /// [`Error::Psk`] if two of them have the same identity.
@@ -33,14 +33,14 @@ impl PskTable {
         Ok(Self { keys: RwLock::new(keys) })
     }
 
-    /// Adds a key; returns the key that had its identity before.
+    /// Adds a key. Returns the key that had this identity before.
     pub fn insert(&self, psk: Arc<Psk>) -> Option<Arc<Psk>> {
         let mut keys = self.keys.write().unwrap_or_else(PoisonError::into_inner);
         keys.insert(psk.identity().to_vec(), psk)
     }
 
-    /// Removes the key with exactly this identity and returns it. Handshakes that begin later are refused;
-    /// [`Psk::erase()`] erases the secret too.
+    /// Removes the key with exactly this identity and returns it. Handshakes that begin later are refused.
+    /// [`Psk::erase()`] also erases the secret.
     pub fn remove(&self, identity: &[u8]) -> Option<Arc<Psk>> {
         self.keys.write().unwrap_or_else(PoisonError::into_inner).remove(identity)
     }

@@ -1,4 +1,4 @@
-//! From a QKD key to a pre-shared key of TLS.
+//! Derives a pre-shared key of TLS from a QKD key.
 
 use std::hint::black_box;
 
@@ -13,9 +13,9 @@ use crate::{Cipher, Error};
 
 /// Derives the pre-shared key of one connection from a QKD key.
 ///
-/// `HKDF-SHA256` with the salt `AXON-QKD-TLS13-EXTERNAL-PSK-v1`, the key, and as info key_ID,
-/// client SAE, server SAE and the name of the cipher's hash, each with its length in front; as long
-/// as that hash.
+/// The derivation is `HKDF-SHA256` with the salt `AXON-QKD-TLS13-EXTERNAL-PSK-v1` and the key. The
+/// info is the key_ID, the client SAE, the server SAE and the name of the cipher's hash, each
+/// preceded by its length. The result is as long as the output of that hash.
 ///
 /// Client and server give the same names in the same order. Equal SAE IDs are refused.
 pub fn derive_psk(
@@ -49,13 +49,13 @@ fn secret(key: &[u8; 32], names: [&str; 4], len: usize) -> Result<Zeroizing<Vec<
     }
     let mut secret = Zeroizing::new(vec![0; len]);
     fill(black_box(key), &info, &mut secret)?;
-    // aws-lc-rs moves the extracted key about and leaves it on the stack. The same code with a
-    // public key overwrites the same places.
+    // aws-lc-rs moves the extracted key and leaves it on the stack. The same code with a public key
+    // overwrites the same places.
     fill(black_box(&[0; 32]), &info, &mut Zeroizing::new(vec![0; len]))?;
     Ok(secret)
 }
 
-/// Never inlined, so that each call is the same code at the same depth.
+/// The function is never inlined, so that each call runs the same code at the same stack depth.
 #[inline(never)]
 fn fill(key: &[u8; 32], info: &[u8], secret: &mut [u8]) -> Result<(), Error> {
     Salt::new(HKDF_SHA256, SALT)
@@ -68,7 +68,8 @@ fn fill(key: &[u8; 32], info: &[u8], secret: &mut [u8]) -> Result<(), Error> {
 const SALT: &[u8] = b"AXON-QKD-TLS13-EXTERNAL-PSK-v1";
 const MAX_SAE_ID: usize = 255;
 
-/// The length as a 16-bit number, then the bytes. All names are short by now.
+/// Appends the length as a 16-bit number, then the bytes. The caller has checked that all names are
+/// short.
 fn length_prefixed(out: &mut Vec<u8>, part: &[u8]) {
     out.extend_from_slice(&(part.len() as u16).to_be_bytes());
     out.extend_from_slice(part);
@@ -91,7 +92,7 @@ mod tests {
     use crate::qkd::client_config;
     use rustls_axon::ClientConnection;
 
-    /// The vectors are from `tests/vectors/make.py`, which knows nothing of this file.
+    /// The vectors come from `tests/vectors/make.py`, which is independent of this file.
     #[test]
     fn vectors() {
         let vectors: Vec<serde_json::Value> =

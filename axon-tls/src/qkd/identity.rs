@@ -1,4 +1,4 @@
-//! The identity of a pre-shared key, as it is sent in the clear.
+//! The identity of a pre-shared key, which is sent in the clear.
 
 use std::fmt;
 
@@ -6,9 +6,9 @@ use crate::Error;
 
 /// `axon-qkd-v1:CLIENT-SAE:key_ID`, with both names percent-encoded.
 ///
-/// Printable ASCII, at most 128 bytes. There is one spelling for each pair of names: the parser
-/// refuses every other, so identities can be compared as bytes. The key_ID is kept exactly as it
-/// was given, case included.
+/// It is printable ASCII of at most 128 bytes. Each pair of names has one spelling, and the parser
+/// refuses all others, so identities can be compared as bytes. The key_ID is kept exactly as given,
+/// including case.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub struct PskIdentity {
     client_sae: String,
@@ -19,7 +19,7 @@ impl PskIdentity {
     /// The longest identity, in bytes.
     pub const MAX_LEN: usize = 128;
 
-    /// Names the key `key_id` of the client `client_sae`.
+    /// Makes the identity of the key `key_id` of the client `client_sae`.
     ///
     /// Fails if one of them is empty, or if the identity would be longer than
     /// [`PskIdentity::MAX_LEN`].
@@ -40,7 +40,8 @@ impl PskIdentity {
         Ok(identity)
     }
 
-    /// Parses what a client sent. Accepts exactly what [`PskIdentity::to_bytes()`] makes.
+    /// Parses the bytes that a client sent. Accepts exactly the output of
+    /// [`PskIdentity::to_bytes()`].
     pub fn parse(bytes: &[u8]) -> Result<Self, Error> {
         if bytes.len() > Self::MAX_LEN {
             return Err(Error::PskIdentity("longer than 128 bytes"));
@@ -58,17 +59,17 @@ impl PskIdentity {
         Ok(identity)
     }
 
-    /// The SAE ID of the client.
+    /// Returns the SAE ID of the client.
     pub fn client_sae(&self) -> &str {
         &self.client_sae
     }
 
-    /// The key_ID, as the client spelled it.
+    /// Returns the key_ID, as the client wrote it.
     pub fn key_id(&self) -> &str {
         &self.key_id
     }
 
-    /// The bytes that the client sends.
+    /// Returns the bytes that the client sends.
     pub fn to_bytes(&self) -> Vec<u8> {
         self.to_string().into_bytes()
     }
@@ -96,7 +97,7 @@ fn encode(f: &mut fmt::Formatter<'_>, name: &str) -> fmt::Result {
 
 const PREFIX: &str = "axon-qkd-v1:";
 
-/// What RFC 3986 section 2.3 leaves as it is.
+/// Returns whether RFC 3986 section 2.3 leaves this byte unescaped.
 fn is_unreserved(byte: u8) -> bool {
     byte.is_ascii_alphanumeric() || matches!(byte, b'-' | b'.' | b'_' | b'~')
 }

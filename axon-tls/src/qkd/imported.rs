@@ -1,4 +1,4 @@
-//! From a QKD key to a pre-shared key of TLS by the importer of RFC 9258.
+//! Imports a QKD key as a pre-shared key of TLS, as RFC 9258 specifies.
 
 use rustls_axon::crypto::aws_lc_rs::cipher_suite::TLS13_CHACHA20_POLY1305_SHA256;
 use rustls_axon::crypto::hash::HashAlgorithm;
@@ -9,19 +9,19 @@ use crate::erase::erasing_stack;
 use crate::psk::Psk;
 use crate::{Cipher, Error};
 
-/// Imports a QKD key for one connection, as RFC 9258 does.
+/// Imports a QKD key for one connection, as RFC 9258 specifies.
 ///
-/// **For peers that are not AXON and speak RFC 9258**; between two ends that both use this crate
-/// [`derive_psk()`](super::derive_psk) is the one to take. A QKD key is used in one of the two forms
-/// and never in both: not by two peers, not in two attempts.
+/// **It is for peers that are not AXON and implement RFC 9258.** If both ends use this crate, use
+/// [`derive_psk()`](super::derive_psk). A QKD key must be used in only one of the two forms: two peers must not use
+/// different forms, and neither may two attempts.
 ///
-/// The external identity is the key_ID, the context is client SAE and server SAE, each with its
-/// length in front, the target protocol is TLS 1.3, and the target KDF is HKDF with the hash of
-/// `cipher`. The QKD key itself has no hash, so SHA-256 is what it is imported with (section 5.1).
-/// The binder is made under `imp binder`, so the two forms are never taken for each other.
+/// The external identity is the key_ID. The context is the client SAE and the server SAE, each preceded by its length.
+/// The target protocol is TLS 1.3, and the target KDF is HKDF with the hash of `cipher`. The QKD key itself has no
+/// hash, so it is imported with SHA-256 (section 5.1). The binder is made under `imp binder`, so the two forms cannot
+/// be confused.
 ///
-/// Client and server give the same names in the same order. Equal SAE IDs are refused, and names
-/// that have not 1 to 255 bytes.
+/// Client and server give the same names in the same order. Equal SAE IDs are refused, and so are names that do not
+/// have 1 to 255 bytes.
 pub fn import_psk(
     key: &[u8; 32],
     key_id: &str,
@@ -38,9 +38,9 @@ pub fn import_psk(
     Ok(ExternalPsk::from(imported).into())
 }
 
-/// What the identity of an imported QKD key says. It is sent in the clear.
+/// The contents of the identity of an imported QKD key. The identity is sent in the clear.
 ///
-/// It names the server too, which [`PskIdentity`](super::PskIdentity) does not.
+/// It also names the server, which [`PskIdentity`](super::PskIdentity) does not.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub struct ImportedIdentity {
     key_id: String,
@@ -50,7 +50,7 @@ pub struct ImportedIdentity {
 }
 
 impl ImportedIdentity {
-    /// Parses what a client sent. Accepts exactly the identities of [`import_psk()`].
+    /// Parses the bytes that a client sent. Accepts exactly the identities of [`import_psk()`].
     pub fn parse(bytes: &[u8]) -> Result<Self, Error> {
         let wrong = |reason| Error::Name { what: "imported PSK identity", reason };
         let identity = TlsIdentity::decode(bytes)
@@ -65,22 +65,22 @@ impl ImportedIdentity {
         Self::new(text(identity.external_identity())?, text(client_sae)?, text(server_sae)?, cipher)
     }
 
-    /// The key_ID, as the client spelled it.
+    /// Returns the key_ID, as the client wrote it.
     pub fn key_id(&self) -> &str {
         &self.key_id
     }
 
-    /// The SAE ID of the client.
+    /// Returns the SAE ID of the client.
     pub fn client_sae(&self) -> &str {
         &self.client_sae
     }
 
-    /// The SAE ID of the server that the client means.
+    /// Returns the SAE ID of the server that the client wants to reach.
     pub fn server_sae(&self) -> &str {
         &self.server_sae
     }
 
-    /// The cipher that the key was imported for.
+    /// Returns the cipher for which the key was imported.
     pub fn cipher(&self) -> Cipher {
         self.cipher
     }
@@ -105,7 +105,7 @@ impl ImportedIdentity {
         Ok(Self { key_id, client_sae, server_sae, cipher })
     }
 
-    /// Both SAE IDs are short, see [`ImportedIdentity::new()`].
+    /// Returns the context. Both SAE IDs are short, see [`ImportedIdentity::new()`].
     fn context(&self) -> Vec<u8> {
         let mut context = Vec::new();
         for name in [&self.client_sae, &self.server_sae] {
@@ -118,7 +118,7 @@ impl ImportedIdentity {
 
 const MAX_NAME: usize = 255;
 
-/// The two names of a context that is exactly that.
+/// Splits a context into its two names. Returns `None` if it holds anything else.
 fn split(context: &[u8]) -> Option<(&[u8], &[u8])> {
     let (client, rest) = prefixed(context)?;
     let (server, rest) = prefixed(rest)?;

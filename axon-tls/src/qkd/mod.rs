@@ -1,19 +1,17 @@
-//! Connections on a pre-shared key that comes from a QKD key.
+//! Connections on a pre-shared key that is derived from a QKD key.
 //!
-//! Both ends have the same 256-bit key and its key_ID from their key managers (KMEs). The client
-//! has to be the one that called `enc_keys`. What is used in TLS is not the key itself but
-//! [`derive_psk()`] of it, which binds it to the names of client and server in their roles, so that
-//! a handshake cannot be reflected (RFC 9257 section 4.1). The identity that the client sends,
-//! [`PskIdentity`], tells the server whose key and which one to ask its KME for.
+//! Both ends have the same 256-bit key and its key_ID from their key managers (KMEs). The client must be the end that
+//! called `enc_keys`. TLS does not use the key itself but the result of [`derive_psk()`]. It binds the key to the names
+//! of client and server in their roles, so that a handshake cannot be reflected (RFC 9257 section 4.1). The identity
+//! that the client sends, [`PskIdentity`], tells the server whose key it is, and which key to request from its KME.
 //!
 //! One key is for one connection.
 //!
-//! A peer that is not AXON, and knows nothing of that derivation, may speak the importer of RFC 9258
-//! instead: [`import_psk()`] makes the same kind of [`Psk`] that way, with the same binding to both
-//! names, and [`ImportedIdentity`] is what its server parses. A server that serves both kinds of
-//! clients looks at the first byte of an identity, which is `a` in one form and 0 in the other. Use
-//! [`derive_psk()`] wherever both ends are yours: its identity is printable, and AXON's daemons use
-//! no other. A key is used in one form, never in both.
+//! A peer that is not AXON, and does not implement that derivation, may implement the importer of RFC 9258 instead.
+//! [`import_psk()`] makes the same kind of [`Psk`] in that way, with the same binding to both names. The server parses
+//! the identity with [`ImportedIdentity`]. A server for both kinds of clients examines the first byte of an identity,
+//! which is `a` in one form and 0 in the other. Use [`derive_psk()`] if both ends use this crate: its identity is
+//! printable, and AXON's daemons use no other. A key is used in one form, never in both.
 //!
 //! ```
 //! use axon_tls::qkd::{self, PskIdentity};
@@ -51,10 +49,10 @@ pub use self::imported::{ImportedIdentity, import_psk};
 pub use crate::psk::{Psk, PskResolver, negotiated, server_config};
 use crate::{Error, PskKex};
 
-/// A client's configuration for one connection on `psk`, with one ALPN protocol, or none if `alpn`
-/// is empty. The cipher is the one that the key was derived for.
+/// Makes a client's configuration for one connection on `psk`. It has one ALPN protocol, or none if `alpn` is empty.
+/// The cipher is the one for which the key was derived.
 ///
-/// [`psk::client_config()`](crate::psk::client_config) is the same for several keys.
+/// [`psk::client_config()`](crate::psk::client_config) does the same for several keys.
 pub fn client_config(psk: Arc<Psk>, kex: PskKex, alpn: &[u8]) -> Result<ClientConfig, Error> {
     crate::psk::client_config(vec![psk], kex, alpn)
 }

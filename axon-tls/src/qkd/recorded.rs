@@ -1,9 +1,10 @@
-//! Whole psk_ke handshakes with OpenSSL, recorded once and replayed: known answers for everything
-//! from the binder to the keys of application data, on machines without OpenSSL.
+//! Replays complete psk_ke handshakes with OpenSSL that were recorded once. They are known answers
+//! for all steps from the binder to the keys of application data, on machines without OpenSSL.
 //!
-//! `recorded/openssl.json` says how it was recorded; `record` in `recorded/record.rs` did it.
-//! OpenSSL accepted what our end had sent, and printed the exporter's value. With the same random
-//! bytes our end must send the same again, byte for byte, and take OpenSSL's part as then.
+//! `recorded/openssl.json` describes how it was recorded; `record` in `recorded/record.rs` recorded
+//! it. OpenSSL accepted what our end had sent, and printed the exporter's value. With the same
+//! random bytes our end must send the same again, byte for byte, and must accept OpenSSL's part
+//! again.
 
 use std::io::{Read, Write};
 use std::sync::Arc;
@@ -32,7 +33,7 @@ const LABEL: &str = "EXPORTER-axon-test";
 const FROM_US: &[u8] = b"from axon\n";
 const FROM_OPENSSL: &[u8] = b"from openssl\n";
 
-/// Our part's random bytes, the same for every call.
+/// The random bytes of our end, which are the same for every call.
 #[derive(Debug)]
 struct Fixed;
 
@@ -73,7 +74,7 @@ fn server(cipher: Cipher) -> ServerConnection {
     ServerConnection::new(Arc::new(config)).unwrap()
 }
 
-/// One recorded connection: who sent what, in turns.
+/// One recorded connection: its flights in order, each with its sender.
 struct Recording {
     cipher: Cipher,
     our_role: String,
@@ -106,9 +107,9 @@ fn from_hex(text: &Value) -> Vec<u8> {
     (0..text.len()).step_by(2).map(byte).collect()
 }
 
-/// What our end sends to the recorded bytes of OpenSSL, and what it made of the connection.
+/// Replays the recorded bytes of OpenSSL. Returns what our end sends and the data that it reads.
 ///
-/// `Err` has the flight at which it gave up.
+/// An error holds the index of the flight at which our end gave up.
 fn replay<S: SideData>(
     conn: &mut ConnectionCommon<S>,
     flights: &[(bool, Vec<u8>)],
@@ -141,7 +142,7 @@ fn replay<S: SideData>(
 }
 
 struct Replayed {
-    /// A flight of ours each.
+    /// The bytes of each flight that our end sent.
     sent: Vec<Vec<u8>>,
     /// Application data.
     read: Vec<u8>,
@@ -167,7 +168,7 @@ fn is_as_recorded<S: SideData>(
 #[test]
 fn openssl_recordings_replay_byte_for_byte() {
     let recordings = recordings();
-    // both roles on both ciphers: SHA-256 and SHA-384
+    // the recordings have both roles with both ciphers, and so SHA-256 and SHA-384
     assert_eq!(recordings.len(), 4);
     for recording in &recordings {
         match &*recording.our_role {
@@ -178,8 +179,8 @@ fn openssl_recordings_replay_byte_for_byte() {
     }
 }
 
-/// What OpenSSL sent counts to the last bit: with any byte of its handshake changed, ours either
-/// refuses it or (in what the protocol ignores) ends where it ended.
+/// Every bit that OpenSSL sent counts. If a byte of its handshake is changed, our end refuses it,
+/// except for bytes that the protocol ignores.
 #[test]
 fn a_changed_recording_never_completes_in_another_way() {
     for recording in recordings() {
@@ -205,15 +206,15 @@ fn a_changed_recording_never_completes_in_another_way() {
                 }
             };
             refused += usize::from(!complete);
-            // what the header of a protected record says for type and version can only be one
-            // thing, and rustls authenticates that rather than what came
+            // the type and version in the header of a protected record have only one valid value,
+            // and rustls authenticates that value instead of the received one
             assert!(!complete || is_type_or_version(bytes, at), "byte {at} changed, and accepted");
         }
         assert!(refused > 0);
     }
 }
 
-/// Whether the byte at `at` is in the type or version of a record's header.
+/// Returns whether the byte at `at` is in the type or version of a record's header.
 fn is_type_or_version(records: &[u8], at: usize) -> bool {
     let mut start = 0;
     while start < records.len() {

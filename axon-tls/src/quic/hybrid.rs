@@ -1,4 +1,4 @@
-//! quinn's crypto on rustls as released.
+//! quinn's crypto traits on the released rustls.
 
 pub(super) use rustls as tls;
 

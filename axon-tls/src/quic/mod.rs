@@ -1,11 +1,10 @@
 //! Both modes as quinn configurations.
 //!
-//! The AES-128-GCM that QUIC prescribes for Initial packets is used for them alone; TLS never
-//! offers it. There is no 0-RTT, and a server hands out 1-RTT keys only after the client's
-//! Finished was verified. QUIC version 1 alone is spoken.
+//! The AES-128-GCM that QUIC prescribes for Initial packets is used only for them; TLS never offers it. There is no
+//! 0-RTT, and a server returns 1-RTT keys only after it has verified the client's Finished. Only QUIC version 1 is
+//! supported.
 //!
-//! An alert of TLS is visible in [`quinn::ConnectionError`] as the code 0x100 + alert:
-//! [`tls_alert()`] takes it out.
+//! An alert of TLS is visible in [`quinn::ConnectionError`] as the code 0x100 + alert. [`tls_alert()`] extracts it.
 //!
 //! | alert | code  | means |
 //! |-------|-------|-------|
@@ -31,7 +30,7 @@ use crate::{Cipher, Error, Negotiated, PskKex};
 /// The application protocol of AXON.
 pub const ALPN: &[u8] = b"axon/1";
 
-/// A client in hybrid mode.
+/// Makes a client in hybrid mode.
 #[cfg(feature = "hybrid")]
 pub fn hybrid_client(
     auth: &Auth,
@@ -41,7 +40,7 @@ pub fn hybrid_client(
     hybrid_client_with(crate::hybrid::client_config(auth, cipher, alpn)?)
 }
 
-/// A server in hybrid mode.
+/// Makes a server in hybrid mode.
 #[cfg(feature = "hybrid")]
 pub fn hybrid_server(
     auth: &Auth,
@@ -51,15 +50,16 @@ pub fn hybrid_server(
     hybrid_server_with(crate::hybrid::server_config(auth, cipher, alpn)?)
 }
 
-/// A client in hybrid mode on a configuration of your own: one that checks a web server's certificate and
-/// shows none itself, say. Make it with [`hybrid::client_builder()`](crate::hybrid::client_builder).
+/// Makes a client in hybrid mode from the caller's own configuration, for example one that verifies a web server's
+/// certificate and shows none itself. Make the configuration with
+/// [`hybrid::client_builder()`](crate::hybrid::client_builder).
 ///
 /// Instead of quinn's `HandshakeData` the connection has [`negotiated()`].
 ///
 /// # Errors
-/// [`Error::NotHybrid`] if the configuration has a group other than X25519MLKEM768 or a suite other than
-/// the two [`Cipher`]s, [`Error::EarlyData`] if it has early data, [`Error::Alpn`] if it has no ALPN
-/// protocol, which QUIC makes mandatory (RFC 9001 section 8.1).
+/// [`Error::NotHybrid`] if the configuration has a group other than X25519MLKEM768 or a suite other than the two
+/// [`Cipher`]s, [`Error::EarlyData`] if it has early data, [`Error::Alpn`] if it has no ALPN protocol, which QUIC makes
+/// mandatory (RFC 9001 section 8.1).
 #[cfg(feature = "hybrid")]
 pub fn hybrid_client_with(tls: rustls::ClientConfig) -> Result<quinn::ClientConfig, Error> {
     crate::hybrid::check(tls.crypto_provider(), tls.enable_early_data)?;
@@ -67,8 +67,8 @@ pub fn hybrid_client_with(tls: rustls::ClientConfig) -> Result<quinn::ClientConf
     Ok(quinn::ClientConfig::new(Arc::new(hybrid::Client::new(tls))))
 }
 
-/// A server in hybrid mode on a configuration of your own: one with a web certificate that asks clients
-/// for none, say. Make it with [`hybrid::server_builder()`](crate::hybrid::server_builder).
+/// Makes a server in hybrid mode from the caller's own configuration, for example one with a web certificate that does
+/// not ask clients for one. Make the configuration with [`hybrid::server_builder()`](crate::hybrid::server_builder).
 ///
 /// ```
 /// use axon_tls::rustls::pki_types::{CertificateDer, PrivateKeyDer};
@@ -93,10 +93,10 @@ pub fn hybrid_server_with(tls: rustls::ServerConfig) -> Result<quinn::ServerConf
     Ok(quinn::ServerConfig::with_crypto(Arc::new(hybrid::Server::new(tls))))
 }
 
-/// A client that offers `psks`, most preferred first. The cipher is the one that the keys are for.
+/// Makes a client that offers `psks`, most preferred first. The cipher is the one that the keys are for.
 ///
 /// # Errors
-/// As [`psk::client_config()`](crate::psk::client_config), and [`Error::Alpn`] if `alpn` is empty.
+/// The same as for [`psk::client_config()`](crate::psk::client_config), and [`Error::Alpn`] if `alpn` is empty.
 pub fn psk_client(
     psks: Vec<Arc<Psk>>,
     kex: PskKex,
@@ -107,7 +107,7 @@ pub fn psk_client(
     Ok(quinn::ClientConfig::new(Arc::new(psk::Client::new(tls))))
 }
 
-/// A server on the pre-shared keys that `resolver` knows.
+/// Makes a server on the pre-shared keys that `resolver` knows.
 ///
 /// # Errors
 /// [`Error::Alpn`] if `alpn` is empty or too long.
@@ -122,12 +122,12 @@ pub fn psk_server(
     Ok(quinn::ServerConfig::with_crypto(Arc::new(psk::Server::new(tls))))
 }
 
-/// A client for one connection on `psk`. The cipher is the one that the key was derived for.
+/// Makes a client for one connection on `psk`. The cipher is the one for which the key was derived.
 pub fn qkd_client(psk: Arc<Psk>, kex: PskKex, alpn: &[u8]) -> Result<quinn::ClientConfig, Error> {
     psk_client(vec![psk], kex, alpn)
 }
 
-/// A server on the pre-shared keys that `resolver` knows: the same as [`psk_server()`].
+/// Makes a server on the pre-shared keys that `resolver` knows, as [`psk_server()`] does.
 pub fn qkd_server(
     resolver: Arc<dyn PskResolver>,
     cipher: Cipher,
@@ -137,19 +137,19 @@ pub fn qkd_server(
     psk_server(resolver, cipher, kex, alpn)
 }
 
-/// What the finished handshake of a connection from this module agreed on.
+/// Returns the result of the finished handshake of a connection from this module.
 ///
-/// It is also what `handshake_data()` of quinn's types holds, as a [`Negotiated`].
+/// `handshake_data()` of quinn's types also holds it, as a [`Negotiated`].
 pub fn negotiated(conn: &quinn::Connection) -> Option<Negotiated> {
     from_handshake_data(conn.handshake_data()?)
 }
 
-/// What quinn gave as handshake data, if it is from a connection from this module.
+/// Converts quinn's handshake data. Returns `None` if the connection is not from this module.
 pub fn from_handshake_data(data: Box<dyn Any>) -> Option<Negotiated> {
     data.downcast().ok().map(|negotiated| *negotiated)
 }
 
-/// The TLS alert that ended a connection, whichever end sent it.
+/// Returns the TLS alert that ended a connection. Either end may have sent it.
 pub fn tls_alert(error: &quinn::ConnectionError) -> Option<u8> {
     let code = match error {
         quinn::ConnectionError::TransportError(error) => u64::from(error.code),
@@ -159,7 +159,7 @@ pub fn tls_alert(error: &quinn::ConnectionError) -> Option<u8> {
     code.checked_sub(0x100).and_then(|alert| u8::try_from(alert).ok())
 }
 
-/// QUIC makes ALPN mandatory (RFC 9001 section 8.1).
+/// Checks that there is a protocol, because QUIC makes ALPN mandatory (RFC 9001 section 8.1).
 fn check_alpn(protocols: &[Vec<u8>]) -> Result<(), Error> {
     let usable = |protocol: &Vec<u8>| (1..=255).contains(&protocol.len());
     if protocols.is_empty() || !protocols.iter().all(usable) {

@@ -1,8 +1,8 @@
-//! What QUIC protects with keys that everybody knows: the integrity tag of Retry packets.
+//! Protection with the public keys of QUIC: the integrity tag of Retry packets.
 
 use aws_lc_rs::aead::{AES_128_GCM, Aad, LessSafeKey, NONCE_LEN, Nonce, UnboundKey};
 
-/// The tag of a Retry packet of QUIC version 1 (RFC 9001 section 5.8).
+/// Returns the tag of a Retry packet of QUIC version 1 (RFC 9001 section 5.8).
 ///
 /// `packet` is the Retry packet without its tag.
 pub(super) fn retry_tag(original_dst_cid: &[u8], packet: &[u8]) -> [u8; TAG_LEN] {
@@ -18,7 +18,7 @@ pub(super) fn retry_tag(original_dst_cid: &[u8], packet: &[u8]) -> [u8; TAG_LEN]
     tag
 }
 
-/// Whether `payload`, which ends with the tag, makes a genuine Retry packet with `header`.
+/// Returns whether `header` and `payload`, which ends with the tag, form a valid Retry packet.
 pub(super) fn is_valid_retry(original_dst_cid: &[u8], header: &[u8], payload: &[u8]) -> bool {
     let Some((token, tag)) = payload.split_last_chunk::<TAG_LEN>() else {
         return false;
@@ -27,7 +27,8 @@ pub(super) fn is_valid_retry(original_dst_cid: &[u8], header: &[u8], payload: &[
     key().open_in_place(Nonce::assume_unique_for_key(NONCE), aad, &mut tag.to_vec()).is_ok()
 }
 
-/// The Retry packet with the connection ID in front that only the client and server know.
+/// Returns the Retry packet after the original connection ID, which only the client and the server
+/// know.
 fn pseudo_packet(original_dst_cid: &[u8], parts: &[&[u8]]) -> Vec<u8> {
     // connection IDs have at most 20 bytes
     let mut pseudo = vec![original_dst_cid.len() as u8];

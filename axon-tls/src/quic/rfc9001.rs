@@ -1,5 +1,5 @@
-//! The sample packets of RFC 9001, appendix A, through the keys that quinn gets from here. A.4, the
-//! Retry packet, is in `protection.rs`.
+//! Checks the sample packets of RFC 9001, appendix A, with the keys that this module gives quinn.
+//! A.4, the Retry packet, is in `protection.rs`.
 
 use super::tls::crypto::aws_lc_rs::cipher_suite::TLS13_CHACHA20_POLY1305_SHA256;
 use super::tls::crypto::cipher::{AeadKey, Iv};
@@ -7,7 +7,8 @@ use super::*;
 
 const DST_CID: &str = "8394c8f03e515708";
 
-/// Packet, clear header, and payload: protecting gives the packet, and unprotecting the others.
+/// Checks a sample in both directions: protection must give the packet, and unprotection must give
+/// the clear header and the payload.
 fn both_ways(sender: &Keys, receiver: &Keys, sample: &Sample) {
     let (header, mut payload) = (hex(sample.header), hex(sample.payload));
     payload.resize(sample.payload_len, 0);
@@ -46,21 +47,21 @@ struct Sample {
     packet: &'static str,
 }
 
-/// A.1 and A.2: a client's Initial packet, under keys from its connection ID alone.
+/// A.1 and A.2: a client's Initial packet, with keys from its connection ID.
 #[test]
 fn client_initial() {
     let (client, server) = ends();
     both_ways(&client, &server, &CLIENT_INITIAL);
 }
 
-/// A.3: the server's, under keys of its own from the same connection ID.
+/// A.3: a server's Initial packet, with its own keys from the same connection ID.
 #[test]
 fn server_initial() {
     let (client, server) = ends();
     both_ways(&server, &client, &SERVER_INITIAL);
 }
 
-/// AES-128-GCM, and no other: by how many packets a key is for (RFC 9001 section 6.6).
+/// The limits on the number of packets (RFC 9001 section 6.6) identify AES-128-GCM.
 #[test]
 fn initial_keys_are_those_of_aes_128_gcm() {
     let (client, _) = ends();
@@ -78,7 +79,7 @@ fn only_version_1_is_spoken() {
     assert!(supported(1).is_ok());
 }
 
-/// A.5: a packet with a short header under ChaCha20-Poly1305, from the key, IV and header key that
+/// A.5: a packet with a short header and ChaCha20-Poly1305, with the key, IV and header key that
 /// the appendix derives.
 #[test]
 fn chacha20_short_header() {

@@ -1,4 +1,4 @@
-//! quinn's crypto traits on a rustls: the `tls` of the module that this one is in.
+//! quinn's crypto traits on a rustls, which is the `tls` of the including module.
 
 use std::any::Any;
 use std::io::Cursor;
@@ -21,7 +21,7 @@ use super::tls::{self, ClientConfig, ServerConfig};
 use crate::erase::{erasing_stack, erasing_stack_of_packet};
 use crate::quic::protection;
 
-/// Client side of quinn's configuration.
+/// The client side of quinn's configuration.
 pub(in crate::quic) struct Client {
     tls: Arc<ClientConfig>,
 }
@@ -42,7 +42,7 @@ impl crypto::ClientConfig for Client {
         let version = supported(version)?;
         let invalid_name = || ConnectError::InvalidServerName(server_name.into());
         let name = ServerName::try_from(server_name).map_err(|_| invalid_name())?.to_owned();
-        // the ClientHello has a binder, which is made with the pre-shared key
+        // the ClientHello has a binder, which is computed with the pre-shared key
         erasing_stack(|| {
             let conn = ClientConnection::new(Arc::clone(&self.tls), version, name, encoded(params))
                 .map_err(|_| ConnectError::EndpointStopping)?;
@@ -51,7 +51,7 @@ impl crypto::ClientConfig for Client {
     }
 }
 
-/// Server side of quinn's configuration.
+/// The server side of quinn's configuration.
 pub(in crate::quic) struct Server {
     tls: Arc<ServerConfig>,
 }
@@ -80,19 +80,20 @@ impl crypto::ServerConfig for Server {
         _version: u32,
         params: &TransportParameters,
     ) -> Box<dyn crypto::Session> {
-        // quinn has had `initial_keys()` say yes to the version, so it is the only one there is
+        // quinn called `initial_keys()` with the version before, which accepts only this one
         let conn = ServerConnection::new(Arc::clone(&self.tls), VERSION, encoded(params));
         Box::new(Session::new(conn.map(Into::into), Side::Server))
     }
 }
 
-/// A TLS handshake inside a QUIC connection, and the keys it leads to.
+/// A TLS handshake inside a QUIC connection, and the resulting keys.
 struct Session {
     side: Side,
-    /// An error if TLS refused to begin: quinn has no other place to hear of it than the first read.
+    /// The connection, or the error with which TLS refused to begin. quinn can report that error only at the first
+    /// read.
     conn: Result<Connection, tls::Error>,
     told_of_handshake_data: bool,
-    /// A server's 1-RTT keys, which TLS has before the client is known to be the client.
+    /// A server's 1-RTT keys. TLS has them before the client has been authenticated.
     withheld: Option<Keys>,
     next_secrets: Option<Box<Secrets>>,
 }
@@ -192,8 +193,8 @@ impl crypto::Session for Session {
     }
 }
 
-/// The next keys, if the handshake has come to them, and with those for data the secrets of the
-/// keys after them, in a box that moves do not copy.
+/// Returns the next keys, if the handshake has reached them. For 1-RTT keys it also returns the secrets of later keys,
+/// in a box, so that moves do not copy them.
 fn change_of_keys(
     conn: &mut Connection,
     buf: &mut Vec<u8>,
@@ -245,7 +246,7 @@ impl crypto::PacketKey for PacketProtection {
 struct HeaderProtection(Box<dyn HeaderProtectionKey>);
 
 impl HeaderProtection {
-    /// The sample, the first byte, and the room that a packet number can take.
+    /// Returns the sample, the first byte, and the four bytes that a packet number may occupy.
     fn parts<'a>(
         &self,
         pn_offset: usize,
@@ -266,7 +267,7 @@ impl crypto::HeaderKey for HeaderProtection {
 
     fn encrypt(&self, pn_offset: usize, packet: &mut [u8]) {
         let (sample, first, packet_number) = self.parts(pn_offset, packet);
-        // of the room for it, no more is changed than the first byte says the packet number takes
+        // only as many of these bytes change as the first byte gives for the packet number's length
         erasing_stack_of_packet(|| self.0.encrypt_in_place(sample, first, packet_number))
             .expect("the sample has its length");
     }
@@ -278,12 +279,12 @@ impl crypto::HeaderKey for HeaderProtection {
 
 const VERSION: Version = Version::V1;
 
-/// QUIC version 1 (RFC 9000), not the drafts that quinn knows too.
+/// Accepts QUIC version 1 (RFC 9000), and not the drafts that quinn also knows.
 fn supported(version: u32) -> Result<Version, UnsupportedVersion> {
     if version == 1 { Ok(VERSION) } else { Err(UnsupportedVersion) }
 }
 
-/// The keys of Initial packets: from a connection ID that everybody sees (RFC 9001 section 5.2).
+/// Returns the keys of Initial packets. They are derived from a public connection ID (RFC 9001 section 5.2).
 fn initial_keys(version: Version, dst_cid: &ConnectionId, side: Side) -> Keys {
     let suite: Suite = TLS13_AES_128_GCM_SHA256
         .tls13()

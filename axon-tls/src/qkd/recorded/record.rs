@@ -1,4 +1,4 @@
-//! How the recordings were made. To make them again, with the `openssl` of `TEST_OPENSSL`:
+//! Makes the recordings. To make them again, with the `openssl` of `TEST_OPENSSL`:
 //! `cargo test -p axon-tls --lib qkd::recorded::record -- --ignored`.
 
 use std::fmt::Write as _;
@@ -25,7 +25,7 @@ const HOW: &str = "Connections over TCP between axon-tls (qkd, psk_ke), whose ra
     after the handshake, axon first. `exporter` is what openssl printed for -keymatexport \
     EXPORTER-axon-test -keymatexportlen 32.";
 
-/// A connection that remembers what went through it.
+/// A connection that records the bytes that pass through it.
 struct Tap {
     socket: TcpStream,
     flights: Vec<(bool, Vec<u8>)>,
@@ -95,9 +95,9 @@ impl OpenSsl {
         Self(child)
     }
 
-    /// The rest of the first line of its output that has `part`, from there on.
+    /// Returns the rest of the first output line that contains `part`, after `part`.
     fn line(&mut self, part: &str) -> String {
-        // one byte a time: what comes after the line is for the next call
+        // the buffer has one byte, so that the bytes after the line remain for the next call
         let mut output = BufReader::with_capacity(1, self.0.stdout.as_mut().unwrap());
         let mut line = String::new();
         loop {
@@ -131,8 +131,9 @@ fn vector(cipher: Cipher) -> Value {
     vectors.into_iter().find(is_ours).unwrap()
 }
 
-/// `SSL_SESSION` in DER, in PEM: version, TLS 1.3, TLS_AES_256_GCM_SHA384, no session ID, the key,
-/// made at second 0 and valid for 127 seconds, which a pre-shared key does not heed.
+/// Writes an `SSL_SESSION` in PEM: version, TLS 1.3, TLS_AES_256_GCM_SHA384, no session ID, and the
+/// key. It was made at second 0 and is valid for 127 seconds, which has no effect on a pre-shared
+/// key.
 fn session_file(secret: &str) -> PathBuf {
     let mut body = vec![2, 1, 1, 2, 2, 3, 4, 4, 2, 0x13, 0x02, 4, 0, 4, 48];
     body.extend(super::from_hex(&Value::from(secret)));
