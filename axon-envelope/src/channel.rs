@@ -1,4 +1,4 @@
-//! Who talks to whom: SAE IDs, the connection's context, and key_IDs.
+//! The identities of a channel: SAE IDs, the context of the connection, and key_IDs.
 
 use alloc::sync::Arc;
 use alloc::vec::Vec;
@@ -7,10 +7,10 @@ use core::fmt;
 
 use zeroize::Zeroizing;
 
-/// Longest SAE ID and longest key_ID, in bytes; the shortest is 1.
+/// The longest SAE ID and the longest key_ID, in bytes. The shortest has 1 byte.
 pub const MAX_ID_LEN: usize = 255;
 
-/// Longest context, in bytes.
+/// The longest context, in bytes.
 pub const MAX_CONTEXT_LEN: usize = u16::MAX as usize;
 
 /// An ID that is empty or longer than [`MAX_ID_LEN`].
@@ -18,20 +18,22 @@ pub const MAX_CONTEXT_LEN: usize = u16::MAX as usize;
 #[error("an ID of {0} bytes: an SAE ID or key_ID has 1 to 255")]
 pub struct IdError(pub usize);
 
-/// A key's name, as the sender's KME spelled it.
+/// The name of a key, as the sender's KME wrote it.
 ///
-/// Compared byte for byte; two spellings of one UUID are two key_IDs. Cheap to clone.
+/// It is compared byte for byte: two spellings of one UUID are two key_IDs. A clone is cheap.
 #[derive(Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct KeyId(Arc<[u8]>);
 
 impl KeyId {
+    /// Makes a key_ID.
+    ///
     /// # Errors
     /// [`IdError`] unless it has 1 to [`MAX_ID_LEN`] bytes.
     pub fn new(id: impl AsRef<[u8]>) -> Result<Self, IdError> {
         Ok(Self(checked_id(id.as_ref())?.into()))
     }
 
-    /// The ID's bytes.
+    /// Returns the bytes of the ID.
     pub fn as_bytes(&self) -> &[u8] {
         &self.0
     }
@@ -43,15 +45,16 @@ impl AsRef<[u8]> for KeyId {
     }
 }
 
-// Slices order and hash as the derived impls of `Arc<[u8]>` do, which look-ups by `&[u8]` rely on.
+// Slices compare and hash as the derived implementations of `Arc<[u8]>` do. Look-ups by `&[u8]`
+// depend on this.
 impl Borrow<[u8]> for KeyId {
     fn borrow(&self) -> &[u8] {
         &self.0
     }
 }
 
-/// Printable ASCII as it is, everything else escaped, so that a peer's key_ID cannot forge a log
-/// line.
+/// Shows printable ASCII unchanged and escapes all other bytes, so that a peer's key_ID cannot
+/// forge a log line.
 impl fmt::Display for KeyId {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}", self.0.escape_ascii())
@@ -64,13 +67,13 @@ impl fmt::Debug for KeyId {
     }
 }
 
-/// One direction of one connection: the SAE that seals, the SAE that opens, and the context both
-/// agreed on.
+/// One direction of one connection: the SAE that seals, the SAE that opens, and the context on
+/// which both agreed.
 ///
-/// All three are bound into every key derived for the channel, so what was sealed for one channel
-/// opens on no other. The context is opaque here. It has to be new for every connection, or
-/// envelopes of an earlier one open again after both ends have restarted; AXON uses the TLS
-/// exporter `EXPORTER-AXQKD001`.
+/// Every key derived for the channel is bound to all three, so an envelope for one channel does not
+/// open on another. The context is opaque to this crate. It must be new for every connection;
+/// otherwise envelopes of an earlier connection open again after both ends have restarted. AXON
+/// uses the TLS exporter `EXPORTER-AXQKD001`.
 #[derive(Clone)]
 pub struct Channel {
     sender: Arc<[u8]>,
@@ -78,7 +81,7 @@ pub struct Channel {
     context: Arc<Zeroizing<Vec<u8>>>,
 }
 
-/// What is wrong with a [`Channel`].
+/// The reason why a [`Channel`] cannot be made.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum ChannelError {
@@ -97,9 +100,11 @@ pub enum ChannelError {
 }
 
 impl Channel {
+    /// Makes a channel.
+    ///
     /// # Errors
-    /// [`ChannelError`] if an ID does not have 1 to 255 bytes, both are the same, or the context is
-    /// over 65,535 bytes.
+    /// [`ChannelError`] if an ID does not have 1 to 255 bytes, both are the same, or the context
+    /// has more than 65,535 bytes.
     pub fn new(
         sender: impl AsRef<[u8]>,
         receiver: impl AsRef<[u8]>,
@@ -121,7 +126,7 @@ impl Channel {
         })
     }
 
-    /// The other direction of the same connection.
+    /// Returns the other direction of the same connection.
     #[must_use]
     pub fn reversed(&self) -> Self {
         Self {
@@ -131,12 +136,12 @@ impl Channel {
         }
     }
 
-    /// SAE ID of the end that seals.
+    /// Returns the SAE ID of the end that seals.
     pub fn sender(&self) -> &[u8] {
         &self.sender
     }
 
-    /// SAE ID of the end that opens.
+    /// Returns the SAE ID of the end that opens.
     pub fn receiver(&self) -> &[u8] {
         &self.receiver
     }
@@ -146,7 +151,7 @@ impl Channel {
     }
 }
 
-/// Leaves the context out: an exporter value is a secret of the connection.
+/// Omits the context, because an exporter value is a secret of the connection.
 impl fmt::Debug for Channel {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Channel")

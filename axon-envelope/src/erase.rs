@@ -1,11 +1,11 @@
-//! Overwriting the stack that secrets were on.
+//! Overwrites the stack after work that had secrets on it.
 
 use core::hint::black_box;
 
 /// Calls `work`, and then overwrites the stack that it used.
 ///
-/// Ciphers have the key of GHASH, the block that masks the tag, and parts of their key on the stack
-/// as they run, and leave them there. The result must not hold a secret by value.
+/// A running cipher has the key of GHASH, the block that masks the tag, and parts of its key on the
+/// stack, and leaves them there. The result must not hold a secret by value.
 pub(crate) fn erasing_stack<T>(work: impl FnOnce() -> T) -> T {
     let result = on_the_stack(work);
     overwrite();
@@ -22,5 +22,6 @@ fn overwrite() {
     black_box([0_u8; DEPTH].as_mut_slice());
 }
 
-/// More than an AEAD takes; without optimization, code in Rust takes several times as much.
+/// The number of bytes that are overwritten. It is more than an AEAD needs. Without optimization,
+/// Rust code needs several times as much.
 const DEPTH: usize = if cfg!(debug_assertions) { 32 * 1024 } else { 4 * 1024 };

@@ -1,4 +1,5 @@
-//! The envelope's clear header: parsing what a peer sent, and the template a sealer fills in.
+//! The envelope's header, which is in the clear: a parser for received headers, and the template
+//! that a sealer completes.
 
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -6,14 +7,14 @@ use alloc::vec::Vec;
 use crate::channel::{KeyId, MAX_ID_LEN};
 use crate::route::{Kind, Route, TopicHash};
 
-/// First bytes of every envelope.
+/// The first bytes of every envelope.
 pub const MAGIC: [u8; 8] = *b"AXQKD001";
-/// Bytes of the AES-GCM nonce: 8 random ones drawn once per key, then the index as a big-endian
-/// u32.
+/// The length of the AES-GCM nonce: 8 random bytes, drawn once per key, and the index as a
+/// big-endian u32.
 pub const NONCE_LEN: usize = 12;
-/// Shortest header: both IDs of one byte.
+/// The length of the shortest header, with both IDs of one byte.
 pub const MIN_HEADER_LEN: usize = FIXED_LEN + 2;
-/// Longest header: both IDs of 255 bytes.
+/// The length of the longest header, with both IDs of 255 bytes.
 pub const MAX_HEADER_LEN: usize = FIXED_LEN + 2 * MAX_ID_LEN;
 
 const KIND_AT: usize = 8;
@@ -23,64 +24,65 @@ const TOPIC_AT: usize = 11;
 const SENDER_AT: usize = 27;
 const FIXED_LEN: usize = SENDER_AT + 1 + 1 + NONCE_LEN;
 
-/// An envelope's header, read and not yet believed.
+/// An envelope's header, parsed and not yet authenticated.
 ///
-/// Everything in it is a claim of its sender until the envelope has opened.
+/// Everything in it is a claim of the sender until the envelope has opened.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Header<'a> {
-    /// Where the message says it belongs.
+    /// The route that the message claims.
     pub route: Route,
-    /// Its place under the key. Can be 10 or more; such an envelope is refused when opened.
+    /// The message's index under the key. It can be 10 or more; an envelope with that index is
+    /// refused when it is opened.
     pub index: u8,
-    /// SAE ID of the sender, 1 to 255 bytes.
+    /// The SAE ID of the sender, 1 to 255 bytes.
     pub sender: &'a [u8],
-    /// The key it is sealed under, 1 to 255 bytes.
+    /// The key_ID of the sealing key, 1 to 255 bytes.
     pub key_id: &'a [u8],
-    /// The AEAD's nonce. Its last four bytes are the index.
+    /// The nonce of the AEAD. Its last four bytes are the index.
     pub nonce: [u8; NONCE_LEN],
 }
 
-/// Bytes that are no AXQKD001 header.
+/// The reason why bytes are not an AXQKD001 header.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum HeaderError {
     /// The bytes end inside the header or the tag.
     #[error("cut short: {given} bytes where at least {needed} are needed")]
     Truncated {
-        /// Bytes needed, as far as the header could be read.
+        /// The number of bytes needed, as far as the header could be read.
         needed: usize,
-        /// Bytes given.
+        /// The number of bytes given.
         given: usize,
     },
-    /// It does not begin with `AXQKD001`.
+    /// The bytes do not begin with `AXQKD001`.
     #[error("does not begin with AXQKD001: another protocol or another version")]
     Magic,
-    /// A kind that is none of topic, request and response.
+    /// The kind is not topic, request or response.
     #[error("kind {0}: only 0 (topic), 1 (request) and 2 (response) exist")]
     Kind(u8),
-    /// A flag that this version does not have.
+    /// A flag is set that this version does not define.
     #[error("flags {0:#04x}: this version defines none")]
     Flags(u8),
-    /// The sender's SAE ID has no bytes.
+    /// The sender's SAE ID is empty.
     #[error("the sender's SAE ID is empty")]
     EmptySender,
-    /// The key_ID has no bytes.
+    /// The key_ID is empty.
     #[error("the key_ID is empty")]
     EmptyKeyId,
     /// The nonce's counter differs from the index.
     #[error("the nonce's counter is not the index")]
     NonceIndex,
-    /// A header handed over by itself has bytes behind its end.
+    /// A header that was given separately has bytes after its end.
     #[error("{0} bytes behind the header's end")]
     Trailing(usize),
 }
 
 impl<'a> Header<'a> {
-    /// Reads the header at the start of `bytes`; also returns its length.
+    /// Parses the header at the start of `bytes`. Also returns its length.
     ///
-    /// Allocates nothing, and reads at most [`MAX_HEADER_LEN`] bytes. There is one encoding of each
-    /// header: what this accepts, a sealer could have written, but for an index of ten or more.
-    ///
+    /// It allocates nothing, and reads at most [`MAX_HEADER_LEN`] bytes. Each header has one
+    /// encoding. A sealer can produce every header that this function accepts, except one with an
+    /// index of ten or more.
     /// ```
     /// # use axon_envelope::{Header, HeaderError};
     /// assert_eq!(Header::parse(b"AXQKD002................................."),
@@ -88,7 +90,7 @@ impl<'a> Header<'a> {
     /// ```
     ///
     /// # Errors
-    /// [`HeaderError`], which depends on these bytes alone, never on a key.
+    /// [`HeaderError`], which depends only on these bytes, never on a key.
     pub fn parse(bytes: &'a [u8]) -> Result<(Self, usize), HeaderError> {
         let mut rest = Reader { bytes, at: 0 };
         if rest.take::<8>()? != &MAGIC {
@@ -141,7 +143,7 @@ impl<'a> Reader<'a> {
     }
 }
 
-/// A sealer's header, complete but for kind, topic and index.
+/// A sealer's header, complete except for kind, topic and index.
 pub(crate) struct Template(Box<[u8]>);
 
 impl Template {
@@ -164,8 +166,8 @@ impl Template {
         self.0.len()
     }
 
-    /// Writes the header of message `index` into `out`, which has exactly [`Self::len`] bytes;
-    /// returns the nonce.
+    /// Writes the header of message `index` into `out`, which has exactly [`Self::len`] bytes.
+    /// Returns the nonce.
     pub(crate) fn write(&self, route: Route, index: u8, out: &mut [u8]) -> [u8; NONCE_LEN] {
         out.copy_from_slice(&self.0);
         out[KIND_AT] = route.kind as u8;

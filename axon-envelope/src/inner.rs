@@ -1,5 +1,5 @@
-//! AXON's prefix of the plaintext: what the receiver acts on, inside the seal and in front of the
-//! payload.
+//! AXON's prefix of the plaintext: the fields that the receiver acts on. They are sealed, before
+//! the payload.
 //!
 //! 64 bytes, big-endian:
 //!
@@ -14,17 +14,17 @@
 //! | 57     | 3     | age: milliseconds the message spent in the sender's hands, u24, saturating |
 //! | 60     | 4     | length of the payload once decompressed, u32                              |
 //!
-//! The envelope itself does not look inside; another application can seal what it likes.
+//! The envelope itself does not read the prefix. Another application can seal any plaintext.
 
-/// Bytes of an encoded [`Header`].
+/// The length of an encoded [`Header`].
 pub const LEN: usize = 64;
 
-/// Largest age a header states, in milliseconds: over four and a half hours.
+/// The largest age that a header can state, in milliseconds. It is more than four and a half hours.
 pub const MAX_AGE_MS: u32 = (1 << 24) - 1;
 
 const FLAG_ZSTD: u8 = 1;
 
-/// What stands in front of a payload.
+/// The fields before a payload.
 ///
 /// ```
 /// use axon_envelope::inner::{Header, RequestId};
@@ -43,19 +43,20 @@ const FLAG_ZSTD: u8 = 1;
 /// ```
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Header {
-    /// The publisher's GID; for a request the client's, for a response the server's.
+    /// The publisher's GID. For a request it is the client's, for a response the server's.
     pub gid: [u8; 16],
-    /// The publisher's count of messages.
+    /// The publisher's message count.
     pub sequence: u64,
-    /// When the message was published, in nanoseconds since the Unix epoch by the sender's clock.
+    /// The time of publication by the sender's clock, in nanoseconds since the Unix epoch.
     pub source_timestamp: i64,
-    /// Which call a request or response belongs to; zeroes for a topic.
+    /// The call to which a request or response belongs. It is zero for a topic.
     pub request_id: RequestId,
     /// Whether the payload is one zstd frame.
     pub compressed: bool,
-    /// Milliseconds the message spent in the sender's hands; [`MAX_AGE_MS`] stands for all above.
+    /// The milliseconds that the message spent in the sender's hands. [`MAX_AGE_MS`] stands for all
+    /// larger values.
     pub age_ms: u32,
-    /// The payload's length in bytes once decompressed.
+    /// The payload's length in bytes after decompression.
     pub uncompressed_len: u32,
 }
 
@@ -68,28 +69,28 @@ pub struct RequestId {
     pub sequence: i64,
 }
 
-/// Plaintext that does not begin with a valid inner header.
+/// The reason why plaintext does not begin with a valid inner header.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// Fewer than [`LEN`] bytes.
+    /// The plaintext has fewer than [`LEN`] bytes.
     #[error("inner header cut short: {0} bytes of 64")]
     Truncated(usize),
-    /// A flag that is not defined.
+    /// An undefined flag is set.
     #[error("inner header flags {0:#04x}: only bit 0 (zstd) is defined")]
     Flags(u8),
-    /// An uncompressed payload of another length than stated.
+    /// The length of an uncompressed payload differs from the stated one.
     #[error("inner header states {stated} bytes of payload, {given} follow")]
     Length {
-        /// Length in the header.
+        /// The length in the header.
         stated: u32,
-        /// Length of what follows it.
+        /// The length of the bytes after the header.
         given: usize,
     },
 }
 
 impl Header {
-    /// The header as it stands in front of the payload.
+    /// Encodes the header as it stands before the payload.
     pub fn encode(&self) -> [u8; LEN] {
         let mut out = [0; LEN];
         out[0..16].copy_from_slice(&self.gid);
@@ -105,12 +106,12 @@ impl Header {
 
     /// Splits opened plaintext into header and payload.
     ///
-    /// The length of a compressed payload is a claim still: decompress into that much room and no
-    /// more.
+    /// The length of a compressed payload is still a claim: decompress into a buffer of that length
+    /// and no more.
     ///
     /// # Errors
-    /// [`Error`] if it is too short, sets an undefined flag, or states another length than an
-    /// uncompressed payload has.
+    /// [`Error`] if the plaintext is too short, sets an undefined flag, or states a length that an
+    /// uncompressed payload does not have.
     pub fn decode(plaintext: &[u8]) -> Result<(Self, &[u8]), Error> {
         let Some((head, payload)) = plaintext.split_first_chunk::<LEN>() else {
             return Err(Error::Truncated(plaintext.len()));

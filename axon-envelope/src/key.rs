@@ -1,4 +1,4 @@
-//! Key bytes as they come from the KME, and what is derived from them.
+//! Keys as the KME delivers them, and the derivation of the AEAD's keys.
 
 use alloc::boxed::Box;
 use core::hint::black_box;
@@ -15,7 +15,7 @@ use crate::erase::erasing_stack;
 
 /// A 256-bit key as a KME delivered it, erased on drop.
 ///
-/// Its bytes come out only through [`ExposeSecret`] and [`derive`](Self::derive):
+/// Its bytes are accessible only through [`ExposeSecret`] and [`derive`](Self::derive):
 ///
 /// ```
 /// use axon_envelope::{KmeKey, secrecy::ExposeSecret};
@@ -36,31 +36,31 @@ use crate::erase::erasing_stack;
 /// let key = KmeKey::take(&mut [1; 32]);
 /// println!("{key:?}");
 /// ```
-// Boxed, so that moving the key copies a pointer and leaves no key bytes behind.
+// The box makes a move of the key copy a pointer, so that a move leaves no key bytes behind.
 pub struct KmeKey(Box<Holder>);
 
-/// What holds the bytes, and erases them on drop.
+/// The owner of the bytes, which erases them on drop.
 type Holder = dyn ExposeSecret<[u8; 32]> + Send + Sync + UnwindSafe + RefUnwindSafe;
 
-/// Key bytes of a length other than 32.
+/// The error for key bytes of a length other than 32.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("the key has {0} bytes; AXQKD001 takes exactly 32: ask the KME for keys of size 256")]
 pub struct KeyLength(pub usize);
 
-/// The operating system gave no random bytes.
+/// The error if the operating system gave no random bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("the system's random number generator failed: {0}")]
 pub struct RandomError(#[from] getrandom::Error);
 
 impl KmeKey {
-    /// Takes the key over and erases the place it came from.
+    /// Takes the key over, and erases `bytes`.
     pub fn take(bytes: &mut [u8; 32]) -> Self {
         let key = Self::copy(bytes);
         bytes.zeroize();
         key
     }
 
-    /// Copies a key; erasing `bytes` stays with the caller.
+    /// Copies a key. The caller has to erase `bytes`.
     ///
     /// # Errors
     /// [`KeyLength`] unless there are exactly 32 bytes.
@@ -68,10 +68,10 @@ impl KmeKey {
         bytes.try_into().map(Self::copy).map_err(|_| KeyLength(bytes.len()))
     }
 
-    /// A key that stays where its holder has it, as in memory that is never swapped out. A
+    /// Makes a key whose bytes stay in `holder`, for example in memory that is never swapped out. A
     /// `SecretBox<[u8; 32]>` of the crate `secrecy` is a holder.
     ///
-    /// The holder erases it on drop, and gives the same bytes each time it is asked.
+    /// The holder must erase the bytes on drop, and must return the same bytes each time.
     pub fn from_holder<H>(holder: H) -> Self
     where
         H: ExposeSecret<[u8; 32]> + Send + Sync + UnwindSafe + RefUnwindSafe + 'static,
@@ -79,21 +79,21 @@ impl KmeKey {
         Self(Box::new(holder))
     }
 
-    /// Runs `derivation` on the key so that nothing of it is left on the stack.
+    /// Runs `derivation` on the key in a way that leaves nothing of the key on the stack.
     ///
-    /// Libraries for hashes, HKDF and ciphers erase their states, but not what they moved, spilled
-    /// or returned by value: their stack frames keep parts of the key and of all that is made of
-    /// it. So the derivation runs again, with 32 zeros for the key: the same code at the same depth
-    /// writes to the same places, whichever they are, takes no more stack, and leaves registers
-    /// without secrets as well. The upper part of that stack is overwritten besides.
+    /// Libraries for hashes, HKDF and ciphers erase their states, but not values that they moved,
+    /// spilled or returned by value. Their stack frames keep parts of the key and of everything
+    /// derived from it. The derivation therefore runs a second time, with 32 zeros as the key. The
+    /// same code at the same depth writes to the same places, uses no more stack, and also leaves
+    /// registers without secrets. In addition, the upper part of that stack is overwritten.
     ///
-    /// That holds if the derivation takes the same way whatever the key is, as code that runs in
-    /// constant time does, and has no side effects. What it returns is moved: a secret in it has to
-    /// be behind a pointer. A signal that interrupts the first run leaves registers on the stack.
+    /// This requires that the derivation takes the same path for every key, as constant-time code
+    /// does, and has no side effects. Its result is moved, so a secret in it has to be behind a
+    /// pointer. A signal that interrupts the first run leaves registers on the stack.
     pub fn derive<T>(&self, derivation: impl Fn(&[u8; 32]) -> T) -> T {
         erasing_stack(|| {
             let derived = run(&derivation, self.expose_secret());
-            // Opaque, so that this run is neither left out nor compiled in another way.
+            // `black_box` prevents the compiler from omitting this run or compiling it differently.
             drop(black_box(run(&derivation, black_box(&[0; 32]))));
             derived
         })
@@ -112,29 +112,29 @@ impl KmeKey {
     }
 }
 
-/// The key's bytes, for a derivation of the caller's own. [`KmeKey::derive`] leaves nothing of them
-/// on the stack.
+/// Gives access to the key's bytes for the caller's own derivation. [`KmeKey::derive`] leaves
+/// nothing of them on the stack.
 impl ExposeSecret<[u8; 32]> for KmeKey {
     fn expose_secret(&self) -> &[u8; 32] {
         self.0.expose_secret()
     }
 }
 
-/// Never inlined, so that each run is the same code at the same depth.
+/// The function is never inlined, so that each run is the same code at the same stack depth.
 #[inline(never)]
 fn run<T>(derivation: &impl Fn(&[u8; 32]) -> T, key: &[u8; 32]) -> T {
     derivation(black_box(key))
 }
 
-/// The AEAD for one KME key in one direction of one connection.
+/// Derives the AEAD for one KME key in one direction of one connection.
 ///
-/// Every field is length-prefixed, so no two different tuples share an info string.
+/// Every field is length-prefixed, so two different tuples never have the same info string.
 pub(crate) fn aead<A: Aead>(channel: &Channel, key_id: &KeyId, key: &KmeKey) -> A {
     const LABEL: &[u8] = b"seal";
     let fields =
         [LABEL, key_id.as_bytes(), channel.sender(), channel.receiver(), channel.context()];
     let lengths = fields.map(|field| {
-        // `KeyId` and `Channel` hold at most 65,535 bytes a field.
+        // `KeyId` and `Channel` hold fields of at most 65,535 bytes.
         (field.len() as u16).to_be_bytes()
     });
     let mut info: [&[u8]; 10] = [&[]; 10];

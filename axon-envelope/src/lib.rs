@@ -1,10 +1,10 @@
-//! AXQKD001: an AEAD envelope for messages sealed under keys that two hosts share by key_ID, as a
-//! QKD key manager (KME, ETSI GS QKD 014) hands them out.
+//! AXQKD001: an AEAD envelope for messages. Its keys are shared by two hosts and identified by key_IDs, as a QKD key
+//! manager (KME, ETSI GS QKD 014) delivers them.
 //!
-//! A key seals at most ten messages in one direction and is then gone. The receiver opens each of
-//! them once. What this crate does not do is move bytes or keys: it has no I/O, no clock, no
-//! threads and no async, so it serves a CAN gateway as well as a QUIC one. `docs/axqkd001.md` in
-//! the repository specifies the format for other implementations, with test vectors.
+//! A key seals at most ten messages in one direction, and is then erased. The receiver opens each message once. This
+//! crate does not transport bytes or keys: it has no I/O, no clock, no threads and no async. It can therefore serve a
+//! CAN gateway as well as a QUIC one. `docs/axqkd001.md` in the repository specifies the format for other
+//! implementations, with test vectors.
 //!
 //! # Example
 //!
@@ -37,27 +37,26 @@
 //!
 //! # What is guaranteed
 //!
-//! - **No nonce repeats.** A [`Sealer`] owns its key and counts; a [`Slot`] is consumed by the one
-//!   message it seals.
-//! - **Nothing opens twice, or elsewhere.** Per key the [`Opener`] remembers each index it has
-//!   opened. Kind, topic, sender, receiver and connection are all bound: a message moved to another
-//!   place does not open there.
-//! - **A refusal tells the sender nothing.** [`OpenError::Refused`] reads the same and does the
-//!   same work whether the key was unknown or retired, the index replayed or the tag wrong.
-//! - **Secrets are erased** on drop, are neither `Clone` nor `Debug`, and are not left behind by
-//!   moves, since they live behind a pointer, nor on the stack by their derivation
-//!   ([`KmeKey::derive`]). A [`Sealer`] or [`Opener`] prints names and counts. A key can stay in
-//!   locked memory of the caller's: [`KmeKey::from_holder`]. Bytes of a key come out only through the
-//!   trait [`ExposeSecret`](secrecy::ExposeSecret) of the crate [`secrecy`] and [`KmeKey::derive`].
+//! - **No nonce repeats.** A [`Sealer`] owns its key and counts messages; a [`Slot`] is consumed by the one message
+//!   that it seals.
+//! - **No message opens twice, or elsewhere.** For each key the [`Opener`] records each index that it has opened. An
+//!   envelope is bound to its kind, topic, sender, receiver and connection: a message that is moved to another place
+//!   does not open there.
+//! - **A refusal tells the sender nothing.** [`OpenError::Refused`] has the same text and does the same work whether
+//!   the key was unknown or retired, the index was replayed, or the tag was wrong.
+//! - **Secrets are erased** on drop, and are neither `Clone` nor `Debug`. Moves leave no copies, because secrets are
+//!   behind a pointer. Their derivation leaves nothing on the stack ([`KmeKey::derive`]). The `Debug` output of a
+//!   [`Sealer`] or [`Opener`] shows names and counts. A key can stay in the caller's locked memory:
+//!   [`KmeKey::from_holder`]. Bytes of a key are accessible only through the trait
+//!   [`ExposeSecret`](secrecy::ExposeSecret) of the crate [`secrecy`] and through [`KmeKey::derive`].
 //!
 //! # Features
 //!
-//! `aws-lc-rs` (default) and `rust-crypto` choose the AEAD; see [`aead`]. Without `aws-lc-rs` the
-//! crate is `no_std` and needs `alloc`. Every type is `Send + Sync`; sealing and opening take `&mut
-//! self`.
+//! `aws-lc-rs` (default) and `rust-crypto` choose the AEAD; see [`aead`]. Without `aws-lc-rs` the crate is `no_std` and
+//! needs `alloc`. Every type is `Send + Sync`; sealing and opening take `&mut self`.
 //!
-//! Nothing allocates while a message is sealed or opened; adding a key does, and with `aws-lc-rs`
-//! the first refusal on a thread, for aws-lc's error queue.
+//! Sealing and opening a message allocate nothing. Adding a key allocates. With `aws-lc-rs` the first refusal on a
+//! thread allocates as well, for aws-lc's error queue.
 
 #![forbid(unsafe_code)]
 #![no_std]
@@ -94,7 +93,7 @@ pub use route::{Kind, NameTooLong, Route, TopicHash};
 pub use seal::{KEY_MAX_AGE, MAX_PLAINTEXT_LEN, Retirement, SealError, Sealer, Slot, Spent};
 pub use secrecy;
 
-/// Bytes of the authentication tag at the end of every envelope.
+/// The length of the authentication tag at the end of every envelope.
 pub const TAG_LEN: usize = 16;
 
 /// Compiles and runs the README's example.

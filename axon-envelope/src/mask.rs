@@ -2,59 +2,60 @@
 
 use core::fmt;
 
-/// Messages a key seals at most; indexes run from 0 to one less.
+/// The most messages that a key seals. Indexes run from 0 to one less.
 pub const MESSAGES_PER_KEY: u8 = 10;
 
-/// How much a message matters to the sender; RETIRE tells the receiver which ones to wait for.
+/// The delivery guarantee of a message. RETIRE tells the receiver for which messages to wait.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Delivery {
-    /// May be lost; the receiver stops waiting for it a few seconds after RETIRE.
+    /// The message may be lost. The receiver stops waiting for it a few seconds after RETIRE.
     BestEffort,
-    /// Will arrive while the connection lives; the receiver keeps the key until it has.
+    /// The message will arrive as long as the connection lives. The receiver keeps the key until it
+    /// has arrived, for a limited time.
     Reliable,
 }
 
-/// A set of message indexes 0 to 9; bit *n* stands for index *n*.
+/// A set of message indexes 0 to 9. Bit *n* stands for index *n*.
 #[derive(Clone, Copy, Default, PartialEq, Eq, Hash)]
 pub struct IndexMask(u16);
 
 impl IndexMask {
-    /// No index.
+    /// The empty set.
     pub const EMPTY: Self = Self(0);
-    /// All ten.
+    /// The set of all ten indexes.
     pub const ALL: Self = Self((1 << MESSAGES_PER_KEY) - 1);
 
-    /// `None` if a bit from 10 upwards is set.
+    /// Makes a set from bits. Returns `None` if a bit from 10 upwards is set.
     pub fn from_bits(bits: u16) -> Option<Self> {
         (bits & !Self::ALL.0 == 0).then_some(Self(bits))
     }
 
-    /// The set as bits, index 0 lowest.
+    /// Returns the set as bits, with index 0 as the lowest.
     pub fn bits(self) -> u16 {
         self.0
     }
 
-    /// Whether `index` is in the set.
+    /// Returns whether `index` is in the set.
     pub fn contains(self, index: u8) -> bool {
         index < MESSAGES_PER_KEY && self.0 & (1 << index) != 0
     }
 
-    /// How many indexes are in the set.
+    /// Returns the number of indexes in the set.
     pub fn len(self) -> usize {
         self.0.count_ones() as usize
     }
 
-    /// Whether the set is empty.
+    /// Returns whether the set is empty.
     pub fn is_empty(self) -> bool {
         self.0 == 0
     }
 
-    /// Whether every index of this set is in `other`.
+    /// Returns whether every index of this set is in `other`.
     pub fn is_subset(self, other: Self) -> bool {
         self.0 & !other.0 == 0
     }
 
-    /// The indexes of this set that are not in `other`.
+    /// Returns the indexes of this set that are not in `other`.
     #[must_use]
     pub fn minus(self, other: Self) -> Self {
         Self(self.0 & !other.0)

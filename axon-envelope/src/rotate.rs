@@ -1,4 +1,4 @@
-//! A sealer that takes the next key by itself.
+//! A sealer that fetches the next key automatically.
 
 use core::fmt;
 use core::time::Duration;
@@ -9,30 +9,31 @@ use crate::key::{KmeKey, RandomError};
 use crate::mask::Delivery;
 use crate::seal::{Retirement, Sealer, Slot};
 
-/// Where a [`RotatingSealer`] gets keys, and whom it tells that one is done.
+/// The source of a [`RotatingSealer`]'s keys, which also learns when a key is retired.
 pub trait KeySource {
-    /// The next key the receiver is known to hold; `None` if there is none now. Does not block.
+    /// Returns the next key that the receiver is known to hold, or `None` if there is none now. It
+    /// does not block.
     ///
-    /// Never the same key twice: the caller's KME delivers each key_ID once.
+    /// It must never return the same key twice. The caller's KME delivers each key_ID once.
     fn next_key(&mut self) -> Option<(KeyId, KmeKey)>;
 
-    /// A key seals no more: the receiver has to be told, as RETIRE does.
+    /// Called when a key seals no more messages. The receiver has to be told, as with RETIRE.
     fn retired(&mut self, retirement: Retirement);
 }
 
-/// Why there is no slot for a message.
+/// The reason why there is no slot for a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum RotateError {
-    /// The source has no key. The message waits or is dropped, and counted.
+    /// The source has no key. The message waits, or is dropped and counted.
     #[error("no key is ready: the demand for keys exceeds what the KME supplies")]
     NoKey,
-    /// No random bytes for the next key's nonce.
+    /// The system gave no random bytes for the next key's nonce.
     #[error(transparent)]
     Random(#[from] RandomError),
 }
 
-/// Seals message after message, with a new key from its [`KeySource`] whenever one is spent.
+/// Seals messages, and takes a new key from its [`KeySource`] whenever one is spent.
 pub struct RotatingSealer<S: KeySource, A: Aead = DefaultAead> {
     channel: Channel,
     source: S,
@@ -40,22 +41,22 @@ pub struct RotatingSealer<S: KeySource, A: Aead = DefaultAead> {
 }
 
 impl<S: KeySource> RotatingSealer<S> {
-    /// A sealer that takes its first key with the first message, with the default AEAD.
+    /// Makes a sealer that takes its first key with the first message, with the default AEAD.
     pub fn new(channel: Channel, source: S) -> Self {
         Self::with_aead(channel, source)
     }
 }
 
 impl<S: KeySource, A: Aead> RotatingSealer<S, A> {
-    /// As [`RotatingSealer::new`], with an AEAD of choice.
+    /// As [`RotatingSealer::new`], with the AEAD that the caller chooses.
     pub fn with_aead(channel: Channel, source: S) -> Self {
         Self { channel, source, sealer: None }
     }
 
-    /// A permit for one message, under the next key if the present one is spent.
+    /// Returns a permit for one message, under the next key if the current one is spent.
     ///
     /// # Errors
-    /// [`RotateError::NoKey`] while the source has none; the call can be repeated.
+    /// [`RotateError::NoKey`] while the source has none. The call can be repeated.
     pub fn slot(&mut self, now: Duration, delivery: Delivery) -> Result<Slot<'_, A>, RotateError> {
         if self.sealer.as_ref().is_none_or(|sealer| sealer.spent(now).is_some()) {
             if let Some(sealer) = self.sealer.take() {
@@ -68,17 +69,17 @@ impl<S: KeySource, A: Aead> RotatingSealer<S, A> {
         sealer.slot(now, delivery).map_err(|_| RotateError::NoKey)
     }
 
-    /// Messages left under the present key, by count alone.
+    /// Returns how many messages the current key can still seal. Its age is not considered.
     pub fn remaining(&self) -> u8 {
         self.sealer.as_ref().map_or(0, Sealer::remaining)
     }
 
-    /// The source of keys.
+    /// Returns the source of keys.
     pub fn source_mut(&mut self) -> &mut S {
         &mut self.source
     }
 
-    /// Ends the sealer: the source, and the present key's sealer if there is one.
+    /// Consumes the sealer. Returns the source, and the sealer of the current key if there is one.
     pub fn into_parts(self) -> (S, Option<Sealer<A>>) {
         (self.source, self.sealer)
     }

@@ -1,10 +1,10 @@
-//! What a message is, and which topic or service it belongs to.
+//! The kind of a message, and the topic or service to which it belongs.
 
 use core::fmt;
 
 use sha2::{Digest, Sha256};
 
-/// What a message is.
+/// The kind of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[repr(u8)]
 pub enum Kind {
@@ -27,21 +27,21 @@ impl Kind {
     }
 }
 
-/// A topic's or service's name on the wire: the first half of
-/// SHA-256(domain u32 big-endian, lp(name), lp(type name)).
+/// The name of a topic or service on the wire: the first half of SHA-256(domain u32 big-endian,
+/// lp(name), lp(type name)).
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct TopicHash(pub [u8; 16]);
 
-/// A topic or type name over 65,535 bytes.
+/// The error for a topic or type name of more than 65,535 bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("a topic or type name of {0} bytes: at most 65,535 can be hashed")]
 pub struct NameTooLong(pub usize);
 
 impl TopicHash {
-    /// The hash of a topic, by its fully qualified name and its type's, in a domain.
+    /// Hashes the fully qualified name and the type name of a topic, in a domain.
     ///
     /// # Errors
-    /// [`NameTooLong`] if either name is over 65,535 bytes.
+    /// [`NameTooLong`] if either name has more than 65,535 bytes.
     pub fn new(domain: u32, topic: &str, type_name: &str) -> Result<Self, NameTooLong> {
         let mut hash = Sha256::new();
         hash.update(domain.to_be_bytes());
@@ -68,12 +68,13 @@ impl fmt::Debug for TopicHash {
     }
 }
 
-/// Where a message belongs. Authenticated: a message opens under no other route.
+/// The kind and the topic or service of a message. They are authenticated: a message opens under no
+/// other route.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Route {
-    /// Sample, request or response.
+    /// The kind: sample, request or response.
     pub kind: Kind,
-    /// Of which topic or service.
+    /// The topic or service.
     pub topic: TopicHash,
 }
 

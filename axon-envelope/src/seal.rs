@@ -1,4 +1,4 @@
-//! Sealing: one key, at most ten messages.
+//! Seals messages: one key for at most ten messages.
 
 use alloc::boxed::Box;
 use core::fmt;
@@ -12,15 +12,15 @@ use crate::key::{self, KmeKey, RandomError};
 use crate::mask::{Delivery, IndexMask, MESSAGES_PER_KEY};
 use crate::route::Route;
 
-/// How long after its first message a key may seal.
+/// The time after its first message in which a key may seal.
 pub const KEY_MAX_AGE: Duration = Duration::from_secs(3600);
 
-/// Longest plaintext AES-GCM allows, in bytes (NIST SP 800-38D, 5.2.1.1).
+/// The longest plaintext that AES-GCM allows, in bytes (NIST SP 800-38D, 5.2.1.1).
 pub const MAX_PLAINTEXT_LEN: u64 = (1 << 36) - 32;
 
 /// Seals up to ten messages under one key.
 ///
-/// Each message takes a [`Slot`], and a slot seals one message: the compiler refuses a second.
+/// Each message needs a [`Slot`], and a slot seals one message. The compiler refuses a second:
 ///
 /// ```compile_fail,E0382
 /// # use axon_envelope::*;
@@ -30,7 +30,7 @@ pub const MAX_PLAINTEXT_LEN: u64 = (1 << 36) - 32;
 /// # }
 /// ```
 ///
-/// Two slots cannot exist at once, and a retired sealer is gone:
+/// Two slots cannot exist at once, and a retired sealer is consumed:
 ///
 /// ```compile_fail,E0499
 /// # use axon_envelope::*;
@@ -55,7 +55,7 @@ pub const MAX_PLAINTEXT_LEN: u64 = (1 << 36) - 32;
 /// # }
 /// ```
 ///
-/// It cannot be copied, or two would count from zero under one key:
+/// It cannot be copied, because two copies would count from zero under one key:
 ///
 /// ```compile_fail,E0599
 /// # use axon_envelope::*;
@@ -72,18 +72,19 @@ struct SealState<A> {
     aead: A,
     template: Template,
     key_id: KeyId,
-    /// Kept until the first message, for a caller that moves the key to another connection.
+    /// The key itself, kept until the first message, for a caller that moves the key to another
+    /// connection.
     key: Option<KmeKey>,
-    /// The lowest index that was never handed to the AEAD.
+    /// The lowest index that was never passed to the AEAD.
     next: u8,
     used: IndexMask,
     reliable: IndexMask,
     first_used: Option<Duration>,
-    /// The latest time a slot was asked for.
+    /// The latest time at which a slot was requested.
     latest: Duration,
 }
 
-/// Why a sealer seals no more.
+/// The reason why a sealer seals no more messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Spent {
@@ -95,39 +96,39 @@ pub enum Spent {
     Age,
 }
 
-/// What became of a sealer's key: the content of RETIRE.
+/// The final state of a sealer's key, which is the content of RETIRE.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Retirement {
     /// The key.
     pub key_id: KeyId,
-    /// Indexes under which a message was sealed.
+    /// The indexes under which a message was sealed.
     pub used: IndexMask,
-    /// Those of them sealed as [`Delivery::Reliable`].
+    /// The indexes under which a message was sealed as [`Delivery::Reliable`].
     pub reliable: IndexMask,
 }
 
-/// Why a message was not sealed. Its index stays free, except after [`SealError::Aead`].
+/// The reason why a message was not sealed. Its index stays free, except after [`SealError::Aead`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum SealError {
-    /// The caller's buffer has not the size needed.
+    /// The caller's buffer does not have the needed size.
     #[error("a buffer of {given} bytes where {needed} are needed")]
     Buffer {
-        /// Bytes needed.
+        /// The number of bytes needed.
         needed: usize,
-        /// Bytes given.
+        /// The number of bytes given.
         given: usize,
     },
-    /// More plaintext than [`MAX_PLAINTEXT_LEN`].
+    /// The plaintext is longer than [`MAX_PLAINTEXT_LEN`].
     #[error("{0} bytes are more than AES-GCM seals under one nonce")]
     TooLong(usize),
-    /// The AEAD failed; the index is used up, and the buffer holds nothing of use.
+    /// The AEAD failed. The index is used up, and the buffer's contents are useless.
     #[error("the AEAD failed")]
     Aead,
 }
 
 impl Sealer {
-    /// A sealer for a key nothing was sealed under before, with the default AEAD.
+    /// Makes a sealer for a key under which nothing was sealed before, with the default AEAD.
     ///
     /// # Errors
     /// [`RandomError`] if the system gives no random bytes for the nonce.
@@ -137,7 +138,8 @@ impl Sealer {
 }
 
 impl<A: Aead> Sealer<A> {
-    /// As [`Sealer::new`], with an AEAD of choice: `Sealer::<RustCrypto>::with_aead(…)`.
+    /// As [`Sealer::new`], with the AEAD that the caller chooses:
+    /// `Sealer::<RustCrypto>::with_aead(…)`.
     ///
     /// # Errors
     /// [`RandomError`] if the system gives no random bytes for the nonce.
@@ -150,8 +152,8 @@ impl<A: Aead> Sealer<A> {
     /// As [`Sealer::with_aead`], with the nonce's first 8 bytes from the caller's own random
     /// source.
     ///
-    /// Nonces differ by their index whatever the prefix is. The prefix is the second line: it
-    /// keeps them apart when one key is, against all rules, given to two sealers.
+    /// Nonces differ by their index for any prefix. The prefix is a second protection: it makes
+    /// nonces differ if one key is given to two sealers, which is forbidden.
     pub fn with_nonce_prefix(
         channel: &Channel,
         key_id: KeyId,
@@ -171,40 +173,41 @@ impl<A: Aead> Sealer<A> {
         }))
     }
 
-    /// The key's name.
+    /// Returns the key_ID.
     pub fn key_id(&self) -> &KeyId {
         &self.0.key_id
     }
 
-    /// Bytes in front of the ciphertext, the same for every message of this sealer.
+    /// Returns the number of bytes before the ciphertext, which is the same for every message of
+    /// this sealer.
     pub fn header_len(&self) -> usize {
         self.0.template.len()
     }
 
-    /// Bytes an envelope has more than its plaintext.
+    /// Returns the difference between the lengths of an envelope and its plaintext.
     pub fn overhead(&self) -> usize {
         self.header_len() + TAG_LEN
     }
 
-    /// Messages left, by count alone.
+    /// Returns how many messages the key can still seal. Its age is not considered.
     pub fn remaining(&self) -> u8 {
         MESSAGES_PER_KEY - self.0.next
     }
 
-    /// Indexes a message was sealed under.
+    /// Returns the indexes under which a message was sealed.
     pub fn mask_used(&self) -> IndexMask {
         self.0.used
     }
 
-    /// Indexes a message was sealed under as [`Delivery::Reliable`].
+    /// Returns the indexes under which a message was sealed as [`Delivery::Reliable`].
     pub fn mask_reliable(&self) -> IndexMask {
         self.0.reliable
     }
 
-    /// Why no further message can be sealed at `now`, if so.
+    /// Returns why no more messages can be sealed at `now`, or `None` if they can.
     ///
-    /// `now` is monotonic time since an instant of the caller's choice, here as everywhere. If it
-    /// goes backwards, it counts as standing still.
+    /// `now` is monotonic time since an instant that the caller chooses, in all functions of this
+    /// type. If it goes backwards, the latest time is used instead.
     pub fn spent(&self, now: Duration) -> Option<Spent> {
         if self.remaining() == 0 {
             return Some(Spent::Messages);
@@ -213,7 +216,7 @@ impl<A: Aead> Sealer<A> {
         (age >= KEY_MAX_AGE).then_some(Spent::Age)
     }
 
-    /// A permit for one message. Dropping it unused uses nothing up.
+    /// Returns a permit for one message. If it is dropped unused, no index is used up.
     ///
     /// # Errors
     /// [`Spent`] after ten messages, or an hour after the first.
@@ -225,16 +228,16 @@ impl<A: Aead> Sealer<A> {
         }
     }
 
-    /// Ends the sealer, erases its key, and says what to tell the receiver.
+    /// Ends the sealer and erases its key. Returns what the receiver has to be told.
     pub fn retire(self) -> Retirement {
         let SealState { key_id, used, reliable, .. } = *self.0;
         Retirement { key_id, used, reliable }
     }
 
-    /// Gives the key back if it has sealed nothing, so that another connection can use it.
+    /// Returns the key if it has sealed nothing, so that another connection can use it.
     ///
     /// # Errors
-    /// The sealer itself, once it has sealed anything.
+    /// The sealer itself, if it has passed a message to the AEAD.
     pub fn into_unused(mut self) -> Result<(KeyId, KmeKey), Self> {
         match self.0.key.take() {
             Some(key) => Ok((self.0.key_id, key)),
@@ -254,8 +257,8 @@ impl<A> fmt::Debug for Sealer<A> {
     }
 }
 
-/// A permit to seal one message under one index. Every way of sealing consumes it, and it cannot be
-/// copied:
+/// A permit to seal one message under one index. Every method that seals consumes it, and it cannot
+/// be copied:
 ///
 /// ```compile_fail,E0599
 /// # use axon_envelope::*;
@@ -269,26 +272,28 @@ pub struct Slot<'a, A = DefaultAead> {
 }
 
 impl<A: Aead> Slot<'_, A> {
-    /// The index the message will have.
+    /// Returns the index that the message will have.
     pub fn index(&self) -> u8 {
         self.state.next
     }
 
-    /// Bytes in front of the ciphertext, as [`Sealer::header_len`]: with another key it can differ.
+    /// Returns the number of bytes before the ciphertext, as [`Sealer::header_len`] does. It can
+    /// differ for another key.
     pub fn header_len(&self) -> usize {
         self.state.template.len()
     }
 
-    /// Bytes the envelope will have more than its plaintext.
+    /// Returns the difference between the lengths of the envelope and its plaintext.
     pub fn overhead(&self) -> usize {
         self.header_len() + TAG_LEN
     }
 
-    /// Seals a message where it lies: `frame` is `header_len` bytes of room, the plaintext, and
-    /// [`TAG_LEN`] bytes of room, and becomes the envelope.
+    /// Seals a message in place. `frame` consists of `header_len` bytes for the header, the
+    /// plaintext, and [`TAG_LEN`] bytes for the tag. It becomes the envelope.
     ///
     /// # Errors
-    /// [`SealError::Buffer`] if there is no room for header and tag, [`SealError::TooLong`].
+    /// [`SealError::Buffer`] if there is no space for header and tag, [`SealError::TooLong`], or
+    /// [`SealError::Aead`].
     pub fn seal_in_place(self, route: Route, frame: &mut [u8]) -> Result<(), SealError> {
         let header_len = self.state.template.len();
         let needed = header_len + TAG_LEN;
@@ -301,12 +306,13 @@ impl<A: Aead> Slot<'_, A> {
         Ok(())
     }
 
-    /// Seals the concatenation of `parts` into the front of `out`; returns the envelope's length.
+    /// Seals the concatenation of `parts` into the front of `out`. Returns the envelope's length.
     ///
-    /// One part is encrypted from where it is into `out`; several are copied there first.
+    /// A single part is encrypted directly into `out`. Several parts are copied there first.
     ///
     /// # Errors
-    /// [`SealError::Buffer`] if `out` is shorter than the envelope, [`SealError::TooLong`].
+    /// [`SealError::Buffer`] if `out` is shorter than the envelope, [`SealError::TooLong`], or
+    /// [`SealError::Aead`].
     pub fn seal_into(
         self,
         route: Route,
@@ -337,12 +343,12 @@ impl<A: Aead> Slot<'_, A> {
         Ok(needed)
     }
 
-    /// Seals with header, body and tag apart: writes the header, encrypts `in_out` where it lies,
+    /// Seals with separate header, body and tag. Writes the header, encrypts `in_out` in place, and
     /// returns the tag. The envelope is the three in this order.
     ///
     /// # Errors
     /// [`SealError::Buffer`] unless `header` has exactly `header_len` bytes,
-    /// [`SealError::TooLong`].
+    /// [`SealError::TooLong`], or [`SealError::Aead`].
     pub fn seal_detached(
         self,
         route: Route,
@@ -370,8 +376,9 @@ impl<A: Aead> Slot<'_, A> {
             return Err(SealError::TooLong(body_len));
         }
 
-        // The index is gone before the AEAD sees it: even if the AEAD panics, no second message
-        // gets its nonce. `slot` handed this permit out only with an index below ten left.
+        // The index is used up before the AEAD runs: even if the AEAD panics, no second message
+        // gets its nonce. `slot` returned this permit only because fewer than ten indexes were
+        // used.
         let index = state.next;
         state.next += 1;
         state.key = None;

@@ -7,7 +7,8 @@ use crate::TAG_LEN;
 use crate::erase::erasing_stack;
 use crate::header::NONCE_LEN;
 
-/// AES-256-GCM by aws-lc-rs, which keeps the key behind a pointer and erases it when freed.
+/// AES-256-GCM by aws-lc-rs. The library keeps the key behind a pointer, and erases it when it
+/// frees it.
 ///
 /// It can be neither copied nor printed:
 ///
@@ -23,7 +24,8 @@ use crate::header::NONCE_LEN;
 /// println!("{aead:?}");
 /// # }
 /// ```
-// "Less safe" means that the caller answers for the nonces, which is what `Sealer` is for.
+// "Less safe" means that the caller is responsible for the nonces. `Sealer` takes this
+// responsibility.
 pub struct AwsLc(LessSafeKey);
 
 impl Aead for AwsLc {

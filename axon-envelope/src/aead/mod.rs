@@ -5,7 +5,7 @@
 //! | `aws-lc-rs`   | `AwsLc`       | aws-lc-rs                | `std`, a C compiler       |
 //! | `rust-crypto` | `RustCrypto`  | `aes-gcm` of RustCrypto  | `alloc`                   |
 //!
-//! Both can be enabled; [`DefaultAead`] is then `AwsLc`. Both write the same bytes.
+//! Both can be enabled. [`DefaultAead`] is then `AwsLc`. Both produce the same bytes.
 
 #[cfg(feature = "aws-lc-rs")]
 mod aws_lc;
@@ -20,32 +20,32 @@ pub use rust_crypto::RustCrypto;
 use crate::TAG_LEN;
 use crate::header::NONCE_LEN;
 
-/// What `Sealer` and `Opener` use unless told otherwise.
+/// The default AEAD of `Sealer` and `Opener`.
 #[cfg(feature = "aws-lc-rs")]
 pub type DefaultAead = AwsLc;
-/// What `Sealer` and `Opener` use unless told otherwise.
+/// The default AEAD of `Sealer` and `Opener`.
 #[cfg(all(feature = "rust-crypto", not(feature = "aws-lc-rs")))]
 pub type DefaultAead = RustCrypto;
 
-/// The AEAD did not seal or open. It does not say why.
+/// The AEAD failed to seal or to open. The error does not give the reason.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("the AEAD refused")]
 pub struct AeadError;
 
-/// AES-256-GCM under one key, with a 12-byte nonce and a 16-byte tag.
+/// AES-256-GCM with one key, a 12-byte nonce and a 16-byte tag.
 ///
-/// Implementations erase the key on drop, leave nothing that is made of it on the stack, compare tags
-/// in constant time, allocate nothing per message, and on a wrong tag may leave anything but the
-/// plaintext in the output buffer. Another algorithm must not be put behind this trait: the
-/// envelope's magic stands for AES-256-GCM.
+/// An implementation erases the key on drop and leaves nothing derived from it on the stack. It compares tags in
+/// constant time and allocates nothing for a message. If a tag is wrong, the output buffer may contain anything but the
+/// plaintext. This trait must not be implemented for another algorithm, because the envelope's magic stands for
+/// AES-256-GCM.
 pub trait Aead: Sized + Send + Sync {
     /// The library's name, for logs and benchmarks.
     const NAME: &'static str;
 
-    /// Prepares the key.
+    /// Prepares a key.
     fn new(key: &[u8; 32]) -> Self;
 
-    /// Encrypts `in_out` where it lies and returns the tag.
+    /// Encrypts `in_out` in place and returns the tag.
     ///
     /// # Errors
     /// [`AeadError`] if it is longer than AES-GCM allows.
@@ -56,10 +56,10 @@ pub trait Aead: Sized + Send + Sync {
         in_out: &mut [u8],
     ) -> Result<[u8; TAG_LEN], AeadError>;
 
-    /// Encrypts `plaintext` into `ciphertext`, of the same length, and returns the tag.
+    /// Encrypts `plaintext` into `ciphertext`, which has the same length, and returns the tag.
     ///
     /// # Errors
-    /// [`AeadError`] if the lengths differ or are more than AES-GCM allows.
+    /// [`AeadError`] if the lengths differ or exceed what AES-GCM allows.
     fn seal_apart(
         &self,
         nonce: &[u8; NONCE_LEN],
@@ -68,10 +68,10 @@ pub trait Aead: Sized + Send + Sync {
         ciphertext: &mut [u8],
     ) -> Result<[u8; TAG_LEN], AeadError>;
 
-    /// Decrypts `in_out` where it lies.
+    /// Decrypts `in_out` in place.
     ///
     /// # Errors
-    /// [`AeadError`] if the tag does not fit.
+    /// [`AeadError`] if the tag is wrong.
     fn open_in_place(
         &self,
         nonce: &[u8; NONCE_LEN],
@@ -80,10 +80,10 @@ pub trait Aead: Sized + Send + Sync {
         tag: &[u8; TAG_LEN],
     ) -> Result<(), AeadError>;
 
-    /// Decrypts `ciphertext` into `plaintext`, of the same length.
+    /// Decrypts `ciphertext` into `plaintext`, which has the same length.
     ///
     /// # Errors
-    /// [`AeadError`] if the lengths differ or the tag does not fit.
+    /// [`AeadError`] if the lengths differ or the tag is wrong.
     fn open_apart(
         &self,
         nonce: &[u8; NONCE_LEN],

@@ -26,7 +26,7 @@ use crate::header::NONCE_LEN;
 /// println!("{aead:?}");
 /// # }
 /// ```
-// Boxed, so that a move copies a pointer and leaves no key schedule behind.
+// The box makes a move copy a pointer, so that a move leaves no key schedule behind.
 pub struct RustCrypto(Box<Aes256Gcm>);
 
 impl Aead for RustCrypto {

@@ -1,35 +1,36 @@
-//! Why an envelope did not open: what may be said aloud, and what stays here.
+//! The reasons why an envelope did not open: those that the sender may learn, and those that stay
+//! on this host.
 
 use core::fmt;
 
 use crate::header::HeaderError;
 
-/// Why an envelope did not open.
+/// The reason why an envelope did not open.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum OpenError {
-    /// It is no AXQKD001 envelope. Found before any key is looked at.
+    /// The bytes are not an AXQKD001 envelope. This is found before any key is used.
     #[error("malformed envelope: {0}")]
     Header(#[from] HeaderError),
-    /// The caller's buffer is shorter than the plaintext. Nothing has happened; it can be opened
-    /// into a larger one.
+    /// The caller's buffer is shorter than the plaintext. The opener's state is unchanged, and the
+    /// envelope can be opened into a larger buffer.
     #[error("a buffer of {given} bytes for a plaintext of {needed}")]
     BufferTooSmall {
-        /// Length of the plaintext.
+        /// The length of the plaintext.
         needed: usize,
-        /// Length of the caller's buffer.
+        /// The length of the caller's buffer.
         given: usize,
     },
-    /// Every cryptographic failure. The sender must not learn more than this.
+    /// All cryptographic failures. The sender must not learn more than this.
     #[error("envelope refused")]
     Refused(Refusal),
 }
 
 impl OpenError {
-    /// Why the envelope was refused, for this host's own log and counters.
+    /// Returns the reason of a refusal, for this host's own log and counters.
     ///
-    /// **Never to be sent to the peer**, not as text, not as an error code and not as a different
-    /// reaction: it tells an attacker which keys live and which indexes are spent.
+    /// **Never send it to the peer**, as text, as an error code or as a different reaction: it
+    /// tells an attacker which keys are valid and which indexes are used.
     pub fn cause(&self) -> Option<RefusalCause> {
         match self {
             Self::Refused(refusal) => Some(refusal.cause()),
@@ -38,11 +39,12 @@ impl OpenError {
     }
 }
 
-/// A refusal that prints nothing of its cause, so that an error passed on by accident keeps it.
+/// A refusal whose output does not contain its cause, so that an error that is passed on by
+/// accident does not reveal it.
 pub struct Refusal(pub(super) RefusalCause);
 
 impl Refusal {
-    /// Why, for this host's own log and counters; see [`OpenError::cause`].
+    /// Returns the cause, for this host's own log and counters; see [`OpenError::cause`].
     pub fn cause(&self) -> RefusalCause {
         self.0
     }
@@ -54,25 +56,27 @@ impl fmt::Debug for Refusal {
     }
 }
 
-/// Why an envelope was refused. For this host alone: see [`OpenError::cause`].
+/// The cause of a refusal. It is only for this host: see [`OpenError::cause`].
 ///
-/// Where several apply, the first in this order is given.
+/// If several apply, the first in this order is given, with one exception: an index that has opened
+/// under a key that is still held is `Replayed`, even if the key's time is over.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[non_exhaustive]
 pub enum RefusalCause {
-    /// The header names another sender than the channel has.
+    /// The header names a sender other than the channel's.
     WrongSender,
-    /// The header names another kind or topic than the caller expects.
+    /// The header names a kind or topic other than the caller expects.
     WrongRoute,
-    /// An index of ten or more.
+    /// The index is ten or more.
     IndexOutOfRange,
-    /// A key this opener never had, or has forgotten it had.
+    /// The opener never had the key, or has forgotten it.
     UnknownKey,
-    /// A key, or an index of it, that is retired: all ten opened, RETIRE came, or too old.
+    /// The key, or this index of it, is retired: all ten messages have opened, RETIRE came, or the
+    /// key is too old.
     Retired,
     /// This index has opened already.
     Replayed,
-    /// The tag does not fit: another key, receiver or context, or a byte was changed.
+    /// The tag is wrong: the key, receiver or context is another one, or a byte was changed.
     Unauthentic,
 }
 

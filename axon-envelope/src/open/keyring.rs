@@ -1,4 +1,4 @@
-//! The keys of an opener: which ones live, what each has opened, and when it goes.
+//! The keys of an opener: the live keys, the indexes opened under each, and when a key is retired.
 
 use alloc::collections::{BTreeMap, VecDeque};
 use core::time::Duration;
@@ -10,14 +10,14 @@ use crate::channel::KeyId;
 use crate::key::KmeKey;
 use crate::mask::IndexMask;
 
-/// Keys by key_ID, live ones and the memory of retired ones in one map, so that one look-up
+/// Keys by key_ID. One map holds live keys and the key_IDs of retired ones, so that one look-up
 /// answers for both.
 pub(super) struct Keyring<A> {
     keys: BTreeMap<KeyId, Slot<A>>,
-    /// Retired key_IDs, oldest first; those beyond the limit leave the map.
+    /// Retired key_IDs, oldest first. Those beyond the limit are removed from the map.
     retired: VecDeque<KeyId>,
     live: usize,
-    /// Messages that RETIRE called used and that had not opened when their key went.
+    /// Messages that RETIRE reported as used and that had not opened when their key was retired.
     missing: usize,
     limits: Limits,
 }
@@ -27,18 +27,19 @@ enum Slot<A> {
     Retired,
 }
 
-/// A key that can still open something.
+/// A key that can still open messages.
 pub(super) struct Live<A> {
     pub(super) aead: A,
     id: KeyId,
-    /// Kept until the first message, for a caller that moves the key to another connection.
+    /// The key itself, kept until the first message opens, for a caller that moves the key to
+    /// another connection.
     key: Option<KmeKey>,
     opened: IndexMask,
     first_opened: Option<Duration>,
     retire: Option<Retire>,
 }
 
-/// A RETIRE that came while messages were still on their way.
+/// A RETIRE that arrived while messages could still arrive.
 struct Retire {
     at: Duration,
     used: IndexMask,
@@ -46,13 +47,14 @@ struct Retire {
 }
 
 impl<A: Aead> Live<A> {
-    /// Indexes that can still open at `now`.
+    /// Returns the indexes that can still open at `now`.
     fn open_indexes(&self, now: Duration, limits: &Limits) -> IndexMask {
         let expected = match (&self.retire, self.first_opened) {
             (Some(retire), _) if now.saturating_sub(retire.at) < limits.best_effort_grace => {
                 retire.used
             }
-            // A stream that was stopped never delivers: without an end its key would stay for good.
+            // A stream that was stopped never delivers its message. Without this limit its key
+            // would be kept forever.
             (Some(retire), _) if now.saturating_sub(retire.at) >= limits.max_age => {
                 IndexMask::EMPTY
             }
@@ -63,12 +65,12 @@ impl<A: Aead> Live<A> {
         expected.minus(self.opened)
     }
 
-    /// How many messages were sealed, as RETIRE says, and have not opened.
+    /// Returns how many messages were sealed according to RETIRE and have not opened.
     fn missing(&self) -> usize {
         self.retire.as_ref().map_or(0, |retire| retire.used.minus(self.opened).len())
     }
 
-    /// Whether message `index` may open at `now`, its tag permitting.
+    /// Checks whether message `index` may open at `now` if its tag is valid.
     fn check(&self, index: u8, now: Duration, limits: &Limits) -> Result<(), RefusalCause> {
         if self.opened.contains(index) {
             Err(RefusalCause::Replayed)
@@ -94,7 +96,8 @@ impl<A: Aead> Keyring<A> {
         if self.live >= self.limits.max_keys {
             return Err(AddKeyError::Full(self.limits.max_keys));
         }
-        // Room for every live key to retire, so that opening a tenth message allocates nothing.
+        // This is space for every live key to retire, so that opening a tenth message allocates
+        // nothing.
         self.retired.reserve(self.live + 1);
         let live = Live {
             aead,
@@ -109,7 +112,7 @@ impl<A: Aead> Keyring<A> {
         Ok(())
     }
 
-    /// The key an envelope names, if that index of it may open now.
+    /// Returns the key that an envelope names, if that index may open now.
     pub(super) fn select(
         &self,
         id: &[u8],
@@ -123,7 +126,7 @@ impl<A: Aead> Keyring<A> {
         }
     }
 
-    /// Notes that message `index` has opened, and retires the key if that was its last.
+    /// Records that message `index` has opened, and retires the key if no index can open any more.
     pub(super) fn opened(&mut self, id: &[u8], index: u8, now: Duration) {
         let Some(Slot::Live(live)) = self.keys.get_mut(id) else { return };
         live.opened.insert(index);
@@ -142,7 +145,7 @@ impl<A: Aead> Keyring<A> {
         if !reliable.is_subset(used) {
             return Err(RetireError::Masks { used, reliable });
         }
-        // A key that has grown too old is gone, whether `expire` has come by or not.
+        // A key that is too old is retired here, even if `expire` was not called since.
         self.retire_if_done(id, now);
         let Some(Slot::Live(live)) = self.keys.get_mut(id) else {
             return Ok(RetireOutcome::NotHeld);
@@ -150,7 +153,7 @@ impl<A: Aead> Keyring<A> {
         if !live.opened.is_subset(used) {
             return Err(RetireError::OpenedUnused { used, opened: live.opened });
         }
-        // The first RETIRE stands: a repeated one must not start the grace time again.
+        // The first RETIRE applies. A repeated one must not restart the grace time.
         live.retire.get_or_insert(Retire { at: now, used, reliable });
         let waiting = live.open_indexes(now, &self.limits);
         self.retire_if_done(id, now);
@@ -175,7 +178,7 @@ impl<A: Aead> Keyring<A> {
         expired
     }
 
-    /// Takes a key out under which nothing has opened.
+    /// Removes and returns a key under which nothing has opened.
     pub(super) fn take_unused(&mut self, id: &[u8]) -> Option<(KeyId, KmeKey)> {
         let Some(Slot::Live(live)) = self.keys.get_mut(id) else { return None };
         if live.retire.is_some() {

@@ -1,4 +1,5 @@
-//! Opening: keys by key_ID, each index once, and one refusal for every cryptographic failure.
+//! Opens envelopes: finds keys by key_ID, opens each index once, and gives one refusal for all
+//! cryptographic failures.
 
 mod error;
 mod keyring;
@@ -19,17 +20,18 @@ use crate::mask::IndexMask;
 use crate::route::Route;
 use crate::seal::KEY_MAX_AGE;
 
-/// Opens what the other end of one [`Channel`] has sealed.
+/// Opens envelopes that the other end of one [`Channel`] has sealed.
 ///
-/// A connection has one for its incoming direction. `now` is monotonic time since an instant of
-/// the caller's choice, the same for all calls; time that goes backwards counts as standing still.
+/// A connection has one opener for its incoming direction. `now` is monotonic time since an instant
+/// that the caller chooses, the same for all calls. If time goes backwards, the latest time is used
+/// instead.
 ///
-/// A retired key is refused when it is added again, and so is one that is held. The memory of
-/// retired key_IDs is bounded by [`Limits::retired_memory`]; beyond it, that a key comes once
-/// rests on the KME, which delivers each key_ID once, and on the channel's context, which is new
-/// with every connection.
+/// A key that is held, or that is retired, is refused when it is added again.
+/// [`Limits::retired_memory`] bounds how many retired key_IDs are remembered. Beyond it, two other
+/// properties ensure that a key is used once: the KME delivers each key_ID once, and the channel's
+/// context is new with every connection.
 ///
-/// It cannot be copied, or each copy would open every message once:
+/// It cannot be copied, because each copy would open every message once:
 ///
 /// ```compile_fail,E0599
 /// # use axon_envelope::*;
@@ -41,23 +43,24 @@ pub struct Opener<A = DefaultAead> {
     channel: Channel,
     keys: Keyring<A>,
     decoy: A,
-    /// The latest time a caller has told.
+    /// The latest time that a caller has given.
     latest: Duration,
 }
 
-/// How much an [`Opener`] keeps, and how long.
+/// Limits on the keys that an [`Opener`] holds, and on their times.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Limits {
-    /// Keys held at most; default 4,096.
+    /// The most keys held. The default is 4,096.
     pub max_keys: usize,
-    /// How long after RETIRE a best-effort message can still open; default 5 s.
+    /// The time after RETIRE in which a best-effort message can still open. The default is 5 s.
     pub best_effort_grace: Duration,
-    /// How long after its first message a key opens without RETIRE, and how long after RETIRE a
-    /// reliable message can still open; default [`KEY_MAX_AGE`] and a minute for what is on its
-    /// way.
+    /// The time after its first message in which a key opens messages without RETIRE, and the time
+    /// after RETIRE in which a reliable message can still open. The default is [`KEY_MAX_AGE`] and
+    /// one minute for messages in transit.
     pub max_age: Duration,
-    /// Retired key_IDs remembered; default 16,384, at most some 100 bytes and the ID each.
+    /// The number of retired key_IDs remembered. The default is 16,384. Each takes at most about
+    /// 100 bytes and the ID.
     pub retired_memory: usize,
 }
 
@@ -72,11 +75,11 @@ impl Default for Limits {
     }
 }
 
-/// Why a key was not added.
+/// The reason why a key was not added.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum AddKeyError {
-    /// [`Limits::max_keys`] are held.
+    /// [`Limits::max_keys`] keys are held.
     #[error("{0} keys are held and none is retired: the sender must retire keys first")]
     Full(usize),
     /// A key with this key_ID is held.
@@ -87,53 +90,53 @@ pub enum AddKeyError {
     Retired,
 }
 
-/// What RETIRE led to.
+/// The result of a RETIRE.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum RetireOutcome {
-    /// Everything had opened, or nothing was to be waited for: the key is erased.
+    /// All messages had opened, or none was to be waited for. The key is erased.
     Erased,
     /// These indexes can still open.
     Waiting(IndexMask),
-    /// No such key is held; usual after all ten messages have opened.
+    /// The key is not held. This is usual after all ten messages have opened.
     NotHeld,
 }
 
-/// A RETIRE that contradicts itself or what has opened. The key stays as it was.
+/// A RETIRE that contradicts itself or the opened messages. The key is unchanged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum RetireError {
-    /// An index is called reliable and not used.
+    /// An index is reliable but not used.
     #[error("reliable indexes {reliable:?} are not among the used {used:?}")]
     Masks {
-        /// Mask of used indexes.
+        /// The mask of used indexes.
         used: IndexMask,
-        /// Mask of reliable ones.
+        /// The mask of reliable indexes.
         reliable: IndexMask,
     },
-    /// An index is called unused whose message has opened.
+    /// A message has opened whose index RETIRE reports as unused.
     #[error("indexes {opened:?} have opened, but only {used:?} are called used")]
     OpenedUnused {
-        /// Mask of used indexes.
+        /// The mask of used indexes.
         used: IndexMask,
-        /// Indexes that have opened.
+        /// The indexes that have opened.
         opened: IndexMask,
     },
 }
 
-/// What [`Opener::expire`] erased, and what never came.
+/// The number of keys that [`Opener::expire`] erased, and of messages that never came.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Expired {
-    /// Keys this call erased.
+    /// The number of keys that this call erased.
     pub keys: usize,
-    /// Messages that RETIRE called used and that never came, under all keys that went since the
-    /// last call, whatever ended them.
+    /// The number of messages that RETIRE reported as used and that never came, under all keys that
+    /// were retired since the last call for any reason.
     pub messages_missing: usize,
 }
 
 impl Opener {
-    /// An opener without keys, with the default AEAD and limits.
+    /// Makes an opener without keys, with the default AEAD and limits.
     ///
     /// # Errors
     /// [`RandomError`] if the system gives no random bytes.
@@ -143,13 +146,13 @@ impl Opener {
 }
 
 impl<A: Aead> Opener<A> {
-    /// As [`Opener::new`], with an AEAD and limits of choice.
+    /// As [`Opener::new`], with the AEAD and limits that the caller chooses.
     ///
     /// # Errors
     /// [`RandomError`] if the system gives no random bytes.
     pub fn with_limits(channel: Channel, limits: Limits) -> Result<Self, RandomError> {
-        // Envelopes that are refused before the tag counts are run against a key that nobody
-        // knows, so that they cost what a wrong tag costs.
+        // An envelope that is refused for another reason than its tag is opened with a random key
+        // that nobody knows, so that the refusal costs as much as a wrong tag.
         let decoy = KmeKey::random()?.derive(A::new);
         Ok(Self { channel, keys: Keyring::new(limits), decoy, latest: Duration::ZERO })
     }
@@ -157,20 +160,21 @@ impl<A: Aead> Opener<A> {
     /// Adds a key that the sender has announced.
     ///
     /// # Errors
-    /// [`AddKeyError`] if the limit is reached or the key_ID was here before; the key is erased.
+    /// [`AddKeyError`] if the limit is reached or the key_ID is known already. The key is erased.
     pub fn add_key(&mut self, key_id: KeyId, key: KmeKey) -> Result<(), AddKeyError> {
         let aead = key::aead(&self.channel, &key_id, &key);
         self.keys.add(key_id, key, aead)
     }
 
-    /// Opens an envelope where it lies; returns the plaintext within it.
+    /// Opens an envelope in place. Returns the plaintext within it.
     ///
-    /// `route` is where the caller expects the message to belong, by the stream or frame it came
-    /// in. A caller that goes by the envelope alone parses it first and passes the header's route.
+    /// `route` is the route that the caller expects from the stream or frame in which the message
+    /// came. A caller without an expectation parses the envelope first and passes the header's
+    /// route.
     ///
     /// # Errors
-    /// [`OpenError::Header`] before any key is looked at, with `envelope` unchanged;
-    /// [`OpenError::Refused`] for everything else, with the body of `envelope` erased.
+    /// [`OpenError::Header`] before any key is used, with `envelope` unchanged;
+    /// [`OpenError::Refused`] for all other failures, with the body of `envelope` erased.
     pub fn open_in_place<'e>(
         &mut self,
         now: Duration,
@@ -185,12 +189,12 @@ impl<A: Aead> Opener<A> {
         Ok(in_out)
     }
 
-    /// Opens an envelope into the front of `out`; returns the plaintext's length.
+    /// Opens an envelope into the front of `out`. Returns the plaintext's length.
     ///
     /// # Errors
-    /// [`OpenError::Header`] and [`OpenError::BufferTooSmall`] before any key is looked at, with
-    /// `out` unchanged; [`OpenError::Refused`] for everything else, with the part of `out` that
-    /// the plaintext would fill erased.
+    /// [`OpenError::Header`] and [`OpenError::BufferTooSmall`] before any key is used, with `out`
+    /// unchanged; [`OpenError::Refused`] for all other failures, with the part of `out` erased that
+    /// the plaintext would fill.
     pub fn open_into(
         &mut self,
         now: Duration,
@@ -209,11 +213,11 @@ impl<A: Aead> Opener<A> {
         Ok(needed)
     }
 
-    /// Opens an envelope given in its three parts, decrypting `in_out` where it lies.
+    /// Opens an envelope given in its three parts. Decrypts `in_out` in place.
     ///
     /// # Errors
-    /// As [`Opener::open_in_place`]; also [`HeaderError::Trailing`] if `header` is longer than the
-    /// header in it.
+    /// The same as for [`Opener::open_in_place`]; also [`HeaderError::Trailing`] if `header` has
+    /// bytes after the header.
     pub fn open_detached(
         &mut self,
         now: Duration,
@@ -227,14 +231,15 @@ impl<A: Aead> Opener<A> {
         })
     }
 
-    /// Notes a RETIRE: the sender seals no more under `key_id`.
+    /// Handles a RETIRE: the sender seals no more messages under `key_id`.
     ///
     /// The key is kept until each index in `reliable` has opened, but no longer than
-    /// [`Limits::max_age`]; the others of `used` can still open for [`Limits::best_effort_grace`].
+    /// [`Limits::max_age`]. The other indexes of `used` can still open for
+    /// [`Limits::best_effort_grace`].
     ///
     /// # Errors
-    /// [`RetireError`] if the masks contradict each other or what has opened: the peer is broken
-    /// or lying, and its connection should be closed.
+    /// [`RetireError`] if the masks contradict each other or the opened messages. The peer is then
+    /// defective or lying, and its connection should be closed.
     pub fn retire(
         &mut self,
         now: Duration,
@@ -246,46 +251,48 @@ impl<A: Aead> Opener<A> {
         self.keys.retire(now, key_id, used, reliable)
     }
 
-    /// Erases the keys whose time is over. To be called about once a second; which messages open
-    /// does not depend on it, only how long a dead key stays in memory.
+    /// Erases the keys whose time is over. Call it about once a second. It only affects how long a
+    /// dead key stays in memory, not which messages open.
     pub fn expire(&mut self, now: Duration) -> Expired {
         let now = self.advance(now);
         self.keys.expire(now)
     }
 
-    /// Takes a key out under which nothing has opened, to announce it on a new connection.
+    /// Removes and returns a key under which nothing has opened, so that it can be announced on a
+    /// new connection.
     pub fn take_unused(&mut self, key_id: &[u8]) -> Option<(KeyId, KmeKey)> {
         self.keys.take_unused(key_id)
     }
 
-    /// The keys under which nothing has opened and that are not being retired.
+    /// Returns the keys under which nothing has opened and for which no RETIRE came.
     pub fn unused_keys(&self) -> impl Iterator<Item = &KeyId> {
         self.keys.unused()
     }
 
-    /// Whether a key can still open something.
+    /// Returns whether a key is held that is not retired.
     pub fn contains(&self, key_id: &[u8]) -> bool {
         self.keys.contains(key_id)
     }
 
-    /// Keys held.
+    /// Returns the number of keys held.
     pub fn key_count(&self) -> usize {
         self.keys.len()
     }
 
-    /// The limits it was made with.
+    /// Returns the limits of this opener.
     pub fn limits(&self) -> &Limits {
         self.keys.limits()
     }
 
-    /// Time never goes backwards, or what has been retired would live again.
+    /// Returns the latest time so far. Time must not go backwards, because retired keys would
+    /// become valid again.
     fn advance(&mut self, now: Duration) -> Duration {
         self.latest = self.latest.max(now);
         self.latest
     }
 
-    /// Every envelope with a well-formed header goes this way: one look-up, one pass of the AEAD
-    /// over all of it, and on failure one erasure, whatever the cause.
+    /// Opens any envelope with a well-formed header. It makes one look-up and one pass of the AEAD
+    /// over the whole body, and on failure erases the output once, whatever the cause.
     fn open_with(
         &mut self,
         now: Duration,
@@ -329,7 +336,7 @@ impl<A: Aead> Opener<A> {
     }
 }
 
-/// Where the ciphertext of an envelope lies.
+/// Returns the range of the ciphertext in an envelope.
 fn body_range(envelope: &[u8]) -> Result<core::ops::Range<usize>, HeaderError> {
     let (_, start) = Header::parse(envelope)?;
     match envelope.len().checked_sub(TAG_LEN) {
@@ -338,7 +345,7 @@ fn body_range(envelope: &[u8]) -> Result<core::ops::Range<usize>, HeaderError> {
     }
 }
 
-/// Shows the channel's SAE IDs and how many keys are held, never a key.
+/// Shows the channel's SAE IDs and the number of keys, never a key.
 impl<A: Aead> fmt::Debug for Opener<A> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Opener")
