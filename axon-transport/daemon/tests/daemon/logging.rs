@@ -147,7 +147,7 @@ fn a_daemon_in_the_background_starts_though_the_file_system_of_its_log_is_full()
     cause_log_lines(&host);
     refused_handshakes(&host);
     assert_eq!(host.status().expect("it answers").pid, daemon);
-    // When it ends, the log is removed, and the next daemon starts as well.
+    // After it was killed, the next daemon starts with the same log.
     signal(daemon, Signal::KILL);
     until("it has ended", || !host.status().is_ok_and(|status| status.pid == daemon));
     let mut next = host.play("idle");

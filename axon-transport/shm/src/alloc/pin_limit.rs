@@ -20,7 +20,7 @@ const PART: u64 = 16;
 /// The longest sample that a reader may pin: a power of two in bytes, or none.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct PinLimit {
-    /// The binary logarithm; 0 for none.
+    /// The binary logarithm of the limit; 0 for none.
     power: u32,
 }
 

@@ -453,7 +453,7 @@ fn a_relay_attached_later_owes_no_earlier_samples() {
         stands_for: Some(vec![gid]),
     };
     assert_eq!(writer.attach(info).unwrap().first, 3);
-    // A thread that waits may pass the head of an earlier time, from before the relay attached.
+    // A waiting thread may still ask with a head from before the relay attached.
     let delivered_up_to = |published| writer.lock().reader_set.delivered_up_to(published);
     assert_eq!([1, 3, 4].map(delivered_up_to), [1, 3, 3]);
 }

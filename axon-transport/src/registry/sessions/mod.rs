@@ -115,7 +115,7 @@ impl<F> Sessions<F> {
         std::mem::take(&mut self.ready)
     }
 
-    /// Drops the packets that wait for a session. It is sent the complete state instead.
+    /// Drops the packets that wait for a session, except for kept ones. It is sent the complete state instead.
     pub(super) fn fall_behind(&mut self, id: &SessionId) {
         if let Some(entry) = self.entries.get_mut(id) {
             entry.outbox.fall_behind();
