@@ -260,7 +260,7 @@ mod tests {
 
     #[test]
     fn the_largest_file_is_read_whole() {
-        // As many lines as there is room for, each of a name of its own.
+        // The file has as many lines as fit. Each has another name.
         let line = |n: u32| {
             let mut key = [0; 32];
             key[..4].copy_from_slice(&n.to_be_bytes());
@@ -275,7 +275,7 @@ mod tests {
         assert!(lines > 15_000);
         let file = TrustFile::parse(&text).unwrap();
         assert_eq!(file.pins().count(), lines as usize);
-        // The last of them counts as the first does.
+        // The last line is parsed like all others: after it is cut, the error names it.
         text = line(0) + &text.replacen(&line(0), "", 1);
         assert!(TrustFile::parse(&text).is_ok());
         text.truncate(text.len() - 10);

@@ -160,11 +160,11 @@ mod tests {
         }
         let hostile: [&[u8]; 10] = [
             b"axon-qkd-v1:robot:key-1",
-            // another protocol, another KDF, more than an identity
+            // another protocol, another KDF, bytes after the identity
             b"\x00\x05key-1\x00\x0d\x00\x05robot\x00\x04base\x03\x03\x00\x01",
             b"\x00\x05key-1\x00\x0d\x00\x05robot\x00\x04base\x03\x04\x00\x03",
             b"\x00\x05key-1\x00\x0d\x00\x05robot\x00\x04base\x03\x04\x00\x01\x00",
-            // no context, one name, a third one
+            // no context, one name, three names
             b"\x00\x05key-1\x00\x00\x03\x04\x00\x01",
             b"\x00\x05key-1\x00\x07\x00\x05robot\x03\x04\x00\x01",
             b"\x00\x05key-1\x00\x10\x00\x05robot\x00\x04base\x00\x01c\x03\x04\x00\x01",
