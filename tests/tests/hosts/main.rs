@@ -47,6 +47,7 @@ mod range;
 mod recorded;
 mod renewal;
 mod repeated;
+mod replaced;
 mod restart;
 mod rules;
 mod seams;

@@ -12,6 +12,7 @@ use axon_shm::{
     qos::{History, Reliability},
 };
 use axon_transport::{
+    access::Verb,
     graph::{Endpoint, EndpointKind},
     internal::graph::verb_of,
 };
@@ -33,7 +34,7 @@ use crate::{
         route::RouteKey,
         stand_in::NoStandIn,
     },
-    link::{LinkMessage, RouteRefused, Unsubscribe},
+    link::{LinkMessage, RouteRefused, RouteSubscriber, Unsubscribe},
 };
 
 impl Peer {
@@ -53,6 +54,7 @@ impl Peer {
         let own =
             with.local.values().map(|(endpoint, reach)| (&**endpoint, reach.toward(self.daemon)));
         let mut wanted = routes::wanted(own, reachable);
+        self.keep_asked(&mut wanted, with);
         let stalls = with.stalls.borrow();
         let blocked = |responses: &RouteKey| stalls.left(&self.identity, responses, now);
         let unanswered = self.unanswered.leave_out(&mut wanted, &self.asked, blocked, now);
@@ -62,6 +64,44 @@ impl Peer {
             self.does_not_ask(key, NOT_TAKEN, now);
         }
         self.feed_services(now);
+    }
+
+    /// Adds the routes that were asked for earlier, and their subscriptions or servers, as long as these exist here. A
+    /// publisher or client may have come to the peer's host that is not in the peer's graph here yet. It is matched there
+    /// because the peer still serves the route, so the route must not end because the one before it left.
+    fn keep_asked(&self, wanted: &mut BTreeMap<RouteKey, WantedRoute>, with: &PeerContext<'_>) {
+        let most = self.asked.most();
+        for (key, asked) in self.asked.iter().filter(|(key, _)| key.kind != Kind::Response) {
+            let before = wanted.get(key);
+            let lacks = |reader: &&RouteSubscriber| {
+                let is_wanted = before.is_some_and(|route| route.has_reader(&reader.gid));
+                !is_wanted && with.local.contains_key(&reader.gid)
+            };
+            let readers: Vec<_> = asked.wanted.subscribers.iter().filter(lacks).cloned().collect();
+            let has_room = before.is_some() || wanted.len() < most;
+            if readers.is_empty() || !has_room || !self.may_come_again(key, asked, before) {
+                continue;
+            }
+            let route = wanted.entry(key.clone()).or_default();
+            route.subscribers.extend(readers);
+            route.subscribers.sort_by_key(|reader| reader.gid);
+        }
+    }
+
+    /// Returns whether a route lost publishers or clients only because they left, and others may come.
+    fn may_come_again(
+        &self,
+        key: &RouteKey,
+        asked: &AskedRoute,
+        wanted: Option<&WantedRoute>,
+    ) -> bool {
+        let is_wanted = |gid: &Gid| {
+            wanted.is_some_and(|route| route.writers.iter().any(|(w, _)| w.gid == *gid))
+        };
+        let writers = asked.wanted.writers.iter().map(|(writer, _)| writer.gid);
+        let left = writers.filter(|gid| !is_wanted(gid)).all(|gid| self.remote.get(&gid).is_none());
+        let verb = if key.kind == Kind::Topic { Verb::Publish } else { Verb::Call };
+        left && self.access.denial(verb, &key.topic).is_none()
     }
 
     /// Returns whether the peer's servers that get requests of this host changed since the last

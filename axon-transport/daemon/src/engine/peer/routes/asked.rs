@@ -127,6 +127,11 @@ impl AskedRoutes {
         }
     }
 
+    /// Returns the most routes that the peer serves.
+    pub(in crate::engine::peer) fn most(&self) -> usize {
+        self.most
+    }
+
     /// Returns the route with this key.
     pub(in crate::engine::peer) fn get(&self, key: &RouteKey) -> Option<&AskedRoute> {
         self.routes.get(key)

@@ -52,6 +52,13 @@ pub(crate) struct WantedRoute {
     pub(crate) writers: Vec<(Endpoint, usize)>,
 }
 
+impl WantedRoute {
+    /// Returns whether this reader is among its readers.
+    pub(in crate::engine::peer) fn has_reader(&self, gid: &Gid) -> bool {
+        self.subscribers.binary_search_by_key(gid, |reader| reader.gid).is_ok()
+    }
+}
+
 /// Matches a peer's writers with this host's readers, as far as the ranges of their sessions permit.
 pub(crate) fn wanted<'a>(
     local: impl IntoIterator<Item = (&'a Endpoint, RangeToHost)>,

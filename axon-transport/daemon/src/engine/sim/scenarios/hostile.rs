@@ -354,8 +354,10 @@ fn a_publisher_that_is_announced_again_does_not_begin_with_any_number() {
     let mut world = world(26, 1, HIGHEST);
     let (on, subscription, route) = publisher(&mut world);
     let bytes = samples(route, "/t", of_raw(1), 1..=2);
-    world.with_raw(0, |raw, _| raw.links[on].open(bytes));
+    let stream = world.with_raw(0, |raw, _| raw.links[on].open(bytes)).unwrap();
     world.run_for(secs(1));
+    // The next stream of the publisher has its turn after this one.
+    world.with_raw(0, |raw, _| raw.links[on].finish(stream));
     let gone =
         GraphUpdate { version: 2, before: 1, removed: vec![of_raw(1)], ..GraphUpdate::default() };
     say(&mut world, on, &LinkMessage::Graph(gone));

@@ -12,6 +12,7 @@ mod moves;
 mod priorities;
 mod radio;
 mod refused;
+mod replaced;
 mod rules;
 mod segment;
 mod torture;

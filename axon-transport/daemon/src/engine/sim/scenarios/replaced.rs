@@ -1,0 +1,39 @@
+//! The last publisher of a topic ends, and another one of the same host comes soon after.
+
+use axon_shm::qos::Qos;
+
+use crate::engine::sim::{
+    network::Path,
+    tests::{millis, modes, secs},
+    world::{Pair, World},
+};
+
+#[test]
+fn no_sample_of_a_new_publisher_is_lost_with_the_route_of_the_one_before() {
+    for (mode, config) in modes() {
+        let mut world = World::new(90, 2, &config);
+        world.network.set_default_path(Path { delay: millis(30), ..Path::default() });
+        let first = world.pair(0, 1, "/topic", Qos::keep_all());
+        world.until(secs(20), World::is_whole);
+        let (subscriber, mut before) = (first.subscription, first.publisher.1);
+        for pause in (0..250).step_by(10) {
+            world.run_for(secs(3));
+            world.hosts[0].rings.end(before);
+            world.hosts[0].touch_graph();
+            world.run_for(millis(pause));
+            let publisher = world.hosts[0].rings.create_publisher("/topic", Qos::keep_all());
+            world.hosts[0].touch_graph();
+            let pair = Pair { publisher: (0, publisher), subscription: subscriber };
+            for _ in 0..30 {
+                assert!(world.publish(pair, 100), "{mode}, {pause}: {}", world.describe());
+                world.run_for(millis(10));
+            }
+            world.run_for(secs(3));
+            let promised = world.hosts[0].rings.promised(publisher, subscriber.1);
+            let (last, given_up) = (promised.last(), world.hosts[0].rings.given_up(publisher));
+            assert_eq!(last, Some(&30), "{mode}, {pause}: it was matched");
+            assert_eq!(world.received(pair), promised, "{mode}, {pause} ms: {given_up} given up");
+            before = publisher;
+        }
+    }
+}
