@@ -24,7 +24,7 @@ use super::{
     mode::pinned,
     pair::{Host, Plan},
     process::{Node, PATIENCE, until},
-    stranger::{Claim, Met, Stranger},
+    stranger::{Claim, Met, Stranger, high_id},
 };
 
 /// Endpoints that one daemon id announces, each with four names of 500 bytes: 24 MB.
@@ -81,7 +81,7 @@ impl Camera {
     }
 
     pub(crate) fn link(&self, id: u8) -> Met {
-        let claim = Claim { daemon: DaemonId([id; 16]), ..Claim::pinned("camera") };
+        let claim = Claim { daemon: high_id(id), ..Claim::pinned("camera") };
         self.stranger.dial(&self.a, &self.auth, &claim).expect("a link")
     }
 
@@ -210,7 +210,7 @@ fn graph_is_bounded_for_all_daemon_ids_of_a_peer_and_the_link_stays() {
     let keys = [SessionKey::generate().unwrap(), SessionKey::generate().unwrap()];
     let sessions = [keys[0].id(), keys[1].id()];
     for (at, (link, session)) in links.iter_mut().zip(sessions).enumerate() {
-        camera.stranger.prove(link, DaemonId([ids[at]; 16]), &[&keys[at]]);
+        camera.stranger.prove(link, high_id(ids[at]), &[&keys[at]]);
         serves_others(&camera, &mut there, || {
             camera.announce(link, session, MANY);
             camera.heard(link, 1);

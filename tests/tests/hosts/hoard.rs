@@ -6,7 +6,7 @@ use axon_daemon::internal::link::{GraphUpdate, LinkMessage};
 use axon_transport::{
     EndpointSpec, Session,
     graph::{Endpoint, EndpointKind},
-    ids::{DaemonId, Gid},
+    ids::Gid,
     internal::SessionKey,
     qos::{Durability, Qos},
 };
@@ -16,7 +16,7 @@ use super::{
     mode::classic,
     pair::{Host, Plan},
     process::{PATIENCE, until},
-    stranger::Met,
+    stranger::{Met, high_id},
 };
 
 pub(crate) const TOPIC: &str = "/hoarded";
@@ -63,11 +63,10 @@ fn in_flight_memory_of_a_peer_is_bounded_across_ids_and_released() {
     let before = camera.memory("VmRSS");
     let mut met = Vec::new();
     let mut streams = Vec::new();
-    // The host's own id is lower, as a rule: it elects.
     let keys: Vec<_> = (0..IDS).map(|_| SessionKey::generate().unwrap()).collect();
     for (id, key) in (0..IDS).map(|id| 0xff - id).zip(&keys) {
         let mut link = camera.link(id);
-        camera.stranger.prove(&mut link, DaemonId([id; 16]), &[key]);
+        camera.stranger.prove(&mut link, high_id(id), &[key]);
         let publisher = Gid::new(key.id(), 1);
         let route = published(&camera, &mut link, publisher);
         let mut header = vec![1, 0, 0, 0];
@@ -108,7 +107,7 @@ fn incomplete_short_messages_are_bounded_for_a_peer_and_freed() {
         let spec = EndpointSpec::new(&*topic, TYPE, Qos::keep_all());
         subscriptions.push(session.create_subscription(spec).unwrap());
         let mut link = camera.link(id);
-        camera.stranger.prove(&mut link, DaemonId([id; 16]), &[key]);
+        camera.stranger.prove(&mut link, high_id(id), &[key]);
         let publishers: Vec<_> = (1..=PUBLISHERS).map(|n| Gid::new(key.id(), n)).collect();
         let route = all_published(&camera, &mut link, &topic, &publishers);
         links.push((link, route, publishers));

@@ -19,7 +19,7 @@ use super::{
     mode::classic,
     pair::{Host, Plan},
     process::{PATIENCE, until},
-    stranger::{Claim, Stranger},
+    stranger::{Claim, Stranger, high_id},
 };
 
 /// More than may cross where the graph of a peer is bounded to 1 MiB.
@@ -351,7 +351,7 @@ fn made_up_keys_keep_no_other_host_out(listed: bool) {
         })
         .collect::<Result<_, _>>()
         .expect("there is a link for each");
-    let claim = Claim { host: "crowd", daemon: DaemonId([0xfe; 16]), auth: 0 };
+    let claim = Claim { host: "crowd", daemon: high_id(0xfe), auth: 0 };
     let auth = Auth::None(SigningKey::generate().unwrap());
     let refused = stranger.dial(&host, &auth, &claim).expect_err("there is none for one more");
     assert!(refused.contains("as many links"), "{refused}");

@@ -18,7 +18,7 @@ use super::{
     mode::{Kmes, classic},
     pair::Plan,
     process::{PATIENCE, until},
-    stranger::{Claim, Stranger},
+    stranger::{Claim, Stranger, high_id},
 };
 
 const TOPIC: &str = "/chatter";
@@ -132,7 +132,7 @@ fn proof_of_another_connection_or_daemon_is_refused() {
     let replayed = prove(&key, &[7; 32], daemon).unwrap();
     let torn = Proof { signature: [3; 64], ..replayed.clone() };
     camera.stranger.say(&mut link, &LinkMessage::Owners(Owners { proofs: vec![replayed, torn] }));
-    camera.stranger.prove(&mut link, DaemonId([0xfe; 16]), &[&key]);
+    camera.stranger.prove(&mut link, high_id(0xfe), &[&key]);
     announce(&mut link, 1);
     camera.a.wait_refusal("the claim, by name", left_out);
     assert_eq!(node_of(&witness, gid), None);

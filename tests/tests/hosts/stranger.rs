@@ -23,6 +23,13 @@ use super::{pair::Host, process::PATIENCE};
 /// Its daemon's id: the highest there is, so that elections are the other side's.
 const ID: DaemonId = DaemonId([0xff; 16]);
 
+/// Returns a daemon id that is higher than a host's own, so that the host elects the stranger's links.
+pub(crate) fn high_id(number: u8) -> DaemonId {
+    let mut id = [0xff; 16];
+    id[15] = number;
+    DaemonId(id)
+}
+
 pub(crate) struct Stranger {
     runtime: tokio::runtime::Runtime,
 }

@@ -199,7 +199,9 @@ impl Inbound {
     /// Continues the streams of a link that waited for its election.
     pub(crate) fn handle_elected(&mut self, link: u64) {
         // In the order in which the peer opened them.
-        for key in self.parked.extract_if(.., |key| key.0 == link).collect::<Vec<_>>() {
+        let elected: Vec<_> = self.parked.iter().filter(|key| key.0 == link).copied().collect();
+        for key in elected {
+            self.parked.remove(&key);
             self.make_ready(key);
         }
     }
