@@ -5,8 +5,8 @@ use axon_transport::config::{Config, Security};
 
 use crate::{error::GatewayError, identity, keys::Kme};
 
-/// Reads the files that a daemon with this configuration would read, its private key included, and says
-/// what the daemon would say of them. Opens no connection and keeps nothing.
+/// Reads the files that a daemon with this configuration would read, its private key included, and reports the errors
+/// that the daemon would report. Opens no connection and keeps nothing.
 ///
 /// From here on this process erases what it frees, where [`ErasingHeap`](crate::ErasingHeap) is
 /// its allocator.

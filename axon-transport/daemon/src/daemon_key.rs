@@ -1,5 +1,6 @@
-//! The key of a daemon, of which its id is made. Beacons say the id to everybody; the daemon proves in HELLO, for the one
-//! connection, that it is its own. A host that claims the id of another one cannot.
+//! The key of a daemon. The daemon's id is a hash of its public key. Beacons contain the id in clear; in HELLO the
+//! daemon proves, for the one connection, that the id is its own. A host that claims the id of another daemon cannot
+//! prove it.
 
 use axon_shm::ids::DaemonId;
 use axon_transport::internal::SessionKey;
@@ -60,13 +61,13 @@ pub struct DaemonProof {
     /// The daemon's public key (Ed25519).
     #[cbor(n(0), with = "minicbor::bytes")]
     pub key: [u8; 32],
-    /// What is signed: `axon daemon proof 1`, the binding, the daemon's id.
+    /// The signature over `axon daemon proof 1`, the binding and the daemon's id.
     #[cbor(n(1), with = "minicbor::bytes")]
     pub signature: [u8; 64],
 }
 
 impl DaemonProof {
-    /// Whether it proves this id on the connection that `binding` is of.
+    /// Returns whether the proof shows this id on the connection of `binding`.
     pub fn proves(&self, id: DaemonId, binding: &ChannelBinding) -> bool {
         let signature = Signature::from_bytes(&self.signature);
         id_of(&self.key) == id

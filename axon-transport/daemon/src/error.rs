@@ -36,7 +36,7 @@ pub enum GatewayError {
     /// The gateway's own session with its daemon.
     #[error("the gateway's session: {0}")]
     Session(#[from] SessionError),
-    /// Its doorbell.
+    /// The gateway's doorbell failed.
     #[error("the gateway's doorbell: {0}")]
     Memory(#[from] ShmError),
     /// The runtime.
@@ -66,7 +66,7 @@ pub enum EndpointError {
         last: u16,
         /// The addresses, for people.
         addresses: String,
-        /// What the last attempt said.
+        /// The error of the last attempt.
         source: io::Error,
     },
     /// quinn refused the socket.

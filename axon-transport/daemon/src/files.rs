@@ -14,15 +14,15 @@ const LARGEST_KEY: u64 = 64 << 10;
 /// Room for some ten thousand certificates that were revoked.
 const LARGEST_PEM: u64 = 4 << 20;
 
-/// What the settings demand of a file, and of what takes its place.
+/// The requirements of the settings for a file and for its replacements.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct FileRules {
     largest: u64,
     secret: bool,
 }
 
-/// What `stat` tells of a file, which differs when its content does: who preserves the time of
-/// writing cannot preserve that of the change.
+/// The metadata of a file. It differs when the content does: a program that preserves the modification time cannot
+/// preserve the change time.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct FileStamp {
     place: (u64, u64),
@@ -33,9 +33,9 @@ pub(crate) struct FileStamp {
 }
 
 impl FileRules {
-    /// Of a file with a secret key: nobody but its owner may read it.
+    /// Requirements for a file with a secret key: only its owner may read it.
     pub(crate) const KEY: Self = Self { largest: LARGEST_KEY, secret: true };
-    /// Of a file with certificates.
+    /// Requirements for a file with certificates.
     pub(crate) const CERTIFICATES: Self = Self::public(LARGEST_PEM);
 
     /// Rules for a file of trusted keys or certificates: it must not be world-writable.
@@ -43,18 +43,18 @@ impl FileRules {
         Self { largest, secret: false }
     }
 
-    /// How the file is now.
+    /// Returns the current stamp of the file.
     ///
     /// # Errors
-    /// Why it cannot be used, if that shows from outside.
+    /// The reason why the file cannot be used, if its metadata shows it.
     pub(crate) fn stamp(&self, path: &Path) -> Result<FileStamp, String> {
         self.judge(&std::fs::metadata(path).map_err(|e| e.to_string())?)
     }
 
-    /// The whole file, into a buffer that never moves and is erased.
+    /// Reads the whole file into a buffer that never moves and is erased.
     ///
     /// # Errors
-    /// It is not what the settings demand of it, cannot be read, or is too large.
+    /// The file does not meet the requirements of the settings, cannot be read, or is too large.
     pub(crate) fn read(&self, path: &Path) -> Result<Zeroizing<Vec<u8>>, String> {
         let text = |e: std::io::Error| e.to_string();
         let mut file = open(path).map_err(text)?;

@@ -40,8 +40,8 @@ pub use control::{DaemonError, DaemonOptions, Start, log, main, run};
 pub use error::{EndpointError, GatewayError};
 pub use keys::KmeError;
 
-/// What the other crates of AXON and its tests use of this one. It is not part of its interface, and changes
-/// with any release.
+/// The items of this crate that the other crates of AXON and its tests use. They are not part of its interface, and
+/// change with any release.
 #[doc(hidden)]
 pub mod internal {
     pub use crate::{

@@ -1,6 +1,6 @@
-//! To which daemon a session belongs. The id of a session, with which its GIDs begin, is a hash of its public
-//! key. The daemon that has the secret key proves it to each peer, for the one connection between them. A host
-//! that saw a GID of another host cannot announce that GID as its own.
+//! Proofs that a session belongs to a daemon. The id of a session, with which its GIDs begin, is a hash of its public
+//! key. The daemon that has the secret key proves it to each peer, for the one connection between them. A host that saw
+//! a GID of another host cannot announce that GID as its own.
 
 use std::{
     collections::HashMap,
@@ -18,7 +18,7 @@ pub const EXPORTER: &[u8] = b"EXPORTER-axon-session-owner";
 
 /// 32 bytes that both ends of one connection know and no other connection has.
 pub type ChannelBinding = [u8; 32];
-/// What the GIDs of one session begin with.
+/// The first bytes of the GIDs of one session.
 pub type SessionPrefix = [u8; 12];
 
 /// Proves, on the connection that `binding` is of, that the daemon `from` has the session of `key`. `None` in a
@@ -37,7 +37,7 @@ pub fn prefix(id: &SessionId) -> SessionPrefix {
     prefix_of(&Gid(id.0))
 }
 
-/// What a GID begins with.
+/// Returns the first bytes of a GID, which its session determines.
 pub fn prefix_of(gid: &Gid) -> SessionPrefix {
     let mut prefix = [0; 12];
     prefix.copy_from_slice(&gid.0[..12]);
@@ -51,7 +51,7 @@ pub struct Proof {
     /// The session's public key (Ed25519).
     #[cbor(n(0), with = "minicbor::bytes")]
     pub key: [u8; 32],
-    /// What is signed: `axon session owner 1`, the binding, the daemon's id, the session's id.
+    /// The signature over `axon session owner 1`, the binding, the daemon's id and the session's id.
     #[cbor(n(1), with = "minicbor::bytes")]
     pub signature: [u8; 64],
 }

@@ -1,16 +1,16 @@
-//! Searches the stack below the caller for what a piece of work left there. For tests.
+//! Searches the stack below the caller for secrets that a piece of work left there. For tests.
 
 use std::{fs::File, hint::black_box, os::unix::fs::FileExt, ptr, thread};
 
 /// Deeper than the calls that the search itself makes.
 const ROOM: usize = 32 << 10;
-/// How far below the caller is searched.
+/// Number of bytes below the caller that are searched.
 const SEARCHED: usize = 512 << 10;
-/// How much of a secret counts as a find.
+/// Number of bytes of a secret that count as a find.
 const PIECE: usize = 8;
 
-/// The numbers of the `secrets` of which `work` leaves a piece on its stack. What `work` returns
-/// is kept until the search is done.
+/// Returns the numbers of the `secrets` of which `work` left a piece on its stack. Keeps the result of `work` until the
+/// search is done.
 pub(crate) fn left_on_the_stack<T>(
     work: impl FnOnce() -> T + Send,
     secrets: impl FnOnce(&T) -> Vec<Vec<u8>> + Send,
@@ -45,7 +45,7 @@ fn below<T>(work: impl FnOnce() -> T) -> T {
 
 #[test]
 fn a_secret_left_on_the_stack_is_found() {
-    /// From a seed that is nowhere as it is.
+    /// The secret is computed from a seed, so that it is stored nowhere.
     fn secret() -> [u8; 32] {
         std::array::from_fn(|at| black_box(at as u8).wrapping_mul(151) ^ 0x5e)
     }

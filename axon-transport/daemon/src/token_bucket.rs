@@ -34,8 +34,8 @@ impl TokenBucket {
         self.until(1.0)
     }
 
-    /// Takes `cost` tokens, in advance where there are fewer. Returns the time until the bucket has gained what was taken in
-    /// advance.
+    /// Takes `cost` tokens, on credit if there are fewer. Returns the time until the bucket has regained the tokens
+    /// that it lent.
     pub(crate) fn owe(&mut self, cost: u32, now: Duration) -> Duration {
         self.fill(now);
         self.tokens -= f64::from(cost);

@@ -50,7 +50,7 @@ impl AttemptControl {
         Ok(())
     }
 
-    /// Writes what was queued. Cancel safe.
+    /// Writes the queued messages. Cancel safe.
     ///
     /// # Errors
     /// The stream ended.
@@ -61,7 +61,7 @@ impl AttemptControl {
         Ok(())
     }
 
-    /// Writes what was queued. Returns the next message of a known type; if not `reads`, no message. Cancel safe.
+    /// Writes the queued messages. Returns the next message of a known type; if not `reads`, no message. Cancel safe.
     ///
     /// # Errors
     /// No further message comes.

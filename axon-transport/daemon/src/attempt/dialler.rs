@@ -186,7 +186,7 @@ impl AttemptDialler {
         let mut tries = 1;
         loop {
             match self.connect(Some(&attempt)).await {
-                // The daemon looks the key up after its first answer. What it says then counts.
+                // The daemon looks the key up after its first answer. Only a repeated refusal after that is final.
                 Err(refusal) if refusal.alert == Some(UNKNOWN_PSK_IDENTITY) && tries < most => {
                     tries += 1;
                     tokio::time::sleep(TRY_AGAIN).await;
@@ -381,7 +381,7 @@ fn bind(config: &Config, target: SocketAddr) -> Result<Option<quinn::Endpoint>, 
     Ok(Some(endpoint))
 }
 
-/// How the handshake under way ends. Without one, never. Cancel safe.
+/// Waits for the end of the handshake under way; without one, waits for ever. Cancel safe.
 async fn handshake(connecting: &mut Option<Connecting>) -> Result<Connection, ConnectionError> {
     let Some(begun) = connecting else { return std::future::pending().await };
     let ended = begun.await;

@@ -1,8 +1,8 @@
 //! Single links made by hand: for tools that show what a daemon accepts and what it refuses.
 //!
-//! An attempt speaks the real protocol over a real connection, with the engine's machines for the dial and the
-//! opening. What it can do against the rules (an unknown PSK identity, a wrong PSK, a tampered or repeated
-//! envelope) is what a hostile peer can do as well.
+//! An attempt speaks the real protocol over a real connection, with the engine's machines for the dial and the opening.
+//! It can break the rules as a hostile peer can: with an unknown PSK identity, a wrong PSK, or a tampered or repeated
+//! envelope.
 
 mod control;
 mod dialler;
@@ -55,11 +55,11 @@ pub enum Bootstrap {
     WrongKey,
 }
 
-/// What is done to an envelope before it is sent.
+/// A change to an envelope before it is sent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Tamper {
-    /// Nothing: it is accepted.
+    /// No change: the daemon accepts it.
     Nothing,
     /// One bit of the ciphertext is flipped.
     FlipBit,
@@ -81,12 +81,12 @@ impl fmt::Debug for AcceptedLink {
     }
 }
 
-/// Tries to become the link of the daemon at `target`. In qkd `sae` is its SAE ID.
+/// Tries to become the link of the daemon at `target`. In qkd `sae` is that daemon's SAE ID.
 ///
 /// Must run within a tokio runtime; uses the settings' KME, addresses and domain.
 ///
 /// # Errors
-/// [`Refusal`]: by whom and why.
+/// [`Refusal`], which names the refusing side and the reason.
 pub async fn link(
     config: &Config,
     target: SocketAddr,
@@ -104,7 +104,7 @@ pub async fn link(
 }
 
 impl AcceptedLink {
-    /// What the handshake agreed on.
+    /// Returns the parameters that the handshake negotiated.
     pub fn negotiated(&self) -> &Negotiated {
         &self.opened.negotiated
     }
@@ -114,8 +114,8 @@ impl AcceptedLink {
         &self.opened.hello.host
     }
 
-    /// Announces a publisher of `topic`, waits until the daemon subscribes to it (it must have a
-    /// subscription of that topic and type), and sends one sealed sample, tampered with as told.
+    /// Announces a publisher of `topic`, waits until the daemon subscribes to it (it must have a subscription of that
+    /// topic and type), and sends one sealed sample, changed as `tamper` says.
     ///
     /// # Errors
     /// [`Refusal`] when the daemon closes the link for it, or never subscribes.
@@ -237,7 +237,7 @@ impl AcceptedLink {
         }
     }
 
-    /// What seals messages, once the sender of message keys is attached.
+    /// Returns the protection that seals messages, once the sender of message keys is attached.
     fn protection(&mut self) -> Option<Seal<'_>> {
         let sender = self.dialler.keyring()?.sender(LINK)?;
         Some(Seal::Envelope { sender, connection: LINK })

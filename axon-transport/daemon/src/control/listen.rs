@@ -186,7 +186,7 @@ pub(super) async fn serve(
     };
     let why = converse(&control, &socket, id, &bell, &turn, death.as_ref()).await;
     tracing::debug!(session = %id, why, "a session ended");
-    // Its descriptors are closed at once, its endpoints removed in its process's turns.
+    // Its descriptors are closed at once, its endpoints removed in the turns of its process.
     drop(socket);
     loop {
         {

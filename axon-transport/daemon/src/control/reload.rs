@@ -292,7 +292,7 @@ mod tests {
         let pinned = Config::builder().classic_key(key.path()).classic_trust(key.path());
         let report = control.take_settings(Ok(pinned.build().unwrap()));
         assert!(report.error.unwrap().contains("security differ from those in force"));
-        // The same for limits.
+        // The same rule holds for limits.
         let mut limited = new.clone();
         let limits = format!("{rules}\n[[limit]]\npeer = \"*\"\nrate = 1");
         limited.access = axon_transport::access::AccessRules::parse(&limits, "f").unwrap();

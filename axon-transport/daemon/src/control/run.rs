@@ -118,7 +118,7 @@ pub enum DaemonError {
     /// Another daemon serves this user and domain.
     #[error("another daemon serves {0} already")]
     Taken(String),
-    /// The session socket cannot be used: what is wrong with its address, and where.
+    /// The session socket cannot be used. The text says what is wrong with its address.
     #[error("{0}")]
     Address(String),
     /// The gateway to other hosts did not start.

@@ -1,22 +1,22 @@
 //! How strongly an address of a daemon is verified, from a proven link down to an unverified beacon.
 
-/// What speaks for a daemon being where a beacon puts it, the best first.
+/// The evidence that a daemon is at the address that a beacon gives, the strongest first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum AddressConfidence {
     /// A link with this very daemon stood there.
     Proven,
-    /// This host lists the address, or had a link with somebody there; and the daemon answered there.
+    /// This host lists the address or had a link with a peer there, and the daemon answered there.
     KnownAnswered,
-    /// This host lists the address, or had a link with somebody there.
+    /// This host lists the address or had a link with a peer there.
     Known,
     /// The daemon answered a probe there.
     Answered,
-    /// A beacon says so, whose source address may be forged.
+    /// Only a beacon gives the address, and its source address may be forged.
     Heard,
 }
 
 impl AddressConfidence {
-    /// How many there are.
+    /// Number of the levels.
     pub(super) const COUNT: usize = 5;
     /// All of them, the best first.
     pub(super) const ALL: [Self; Self::COUNT] =

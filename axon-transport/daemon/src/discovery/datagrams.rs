@@ -17,12 +17,12 @@ impl Datagrams {
         self.all.push((from, self.bytes.len()));
     }
 
-    /// How many there are.
+    /// Returns the number of datagrams.
     pub fn len(&self) -> usize {
         self.all.len()
     }
 
-    /// Whether there is none.
+    /// Returns whether there is no datagram.
     pub fn is_empty(&self) -> bool {
         self.all.is_empty()
     }

@@ -17,17 +17,17 @@ const MAX_ADDRESSES: usize = 64;
 /// One address of one network interface that is up.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) struct Interface {
-    /// As `ip link` shows it.
+    /// The name, as `ip link` shows it.
     pub name: String,
     /// The kernel's number of it.
     pub index: u32,
     /// One of its addresses.
     pub address: IpAddr,
-    /// How many leading bits of the address are the subnet's.
+    /// The length of the subnet prefix, in bits.
     pub prefix: u8,
     /// The subnet's broadcast address, if it has one.
     pub broadcast: Option<Ipv4Addr>,
-    /// Whether it leads no further than this host.
+    /// Whether the interface is a loopback interface, which does not leave this host.
     pub loopback: bool,
 }
 
@@ -47,8 +47,8 @@ impl Interface {
         }
     }
 
-    /// Whether it connects containers or virtual machines of this host, whose addresses say
-    /// nothing to another host.
+    /// Returns whether the interface connects containers or virtual machines of this host. Its addresses have no
+    /// meaning on another host.
     pub(crate) fn is_virtual(&self) -> bool {
         ["docker", "br-", "veth", "virbr", "cni", "lxc"]
             .iter()

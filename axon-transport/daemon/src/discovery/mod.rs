@@ -55,26 +55,26 @@ pub fn shared_group(domain: u32) -> SocketAddrV4 {
     SocketAddrV4::new(Ipv4Addr::new(239, 255, 88, last), 61_000 + domain)
 }
 
-/// Whether a datagram on a QUIC port that begins with this byte is discovery's and not QUIC's.
+/// Returns whether a datagram on a QUIC port that begins with this byte belongs to discovery and not to QUIC.
 pub(crate) const fn is_discovery(first_byte: u8) -> bool {
     first_byte & 0b1100_0000 == 0
 }
 
-/// What discovery asks of the daemon.
+/// A request of discovery to the daemon.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum DiscoveryAction {
     /// Dial this daemon. To be answered with [`DiscoveryEvent::LinkUp`] or [`DiscoveryEvent::DialFailed`]; without
     /// an answer it counts as failed after 30 s.
     Dial {
-        /// Whom to expect there.
+        /// The id of the expected daemon.
         daemon: DaemonId,
         /// In qkd its SAE ID, for the KME.
         sae: Option<String>,
-        /// Where it may be, best first: one to eight addresses.
+        /// The addresses to try, best first: one to eight.
         addrs: Vec<SocketAddr>,
-        /// Whether we list it, for our HELLO.
+        /// Whether this host lists the peer; our HELLO contains it.
         listed: bool,
-        /// Why it may be there; the answer says it again.
+        /// The evidence for the addresses; the answer to the action repeats it.
         standing: AddressConfidence,
     },
     /// A linked peer has these addresses, best first; they are candidates for a second path.
@@ -86,16 +86,16 @@ pub(crate) enum DiscoveryAction {
     },
     /// Send this from the QUIC port, best effort.
     SendFromQuicPort {
-        /// Where to.
+        /// The destination.
         to: SocketAddr,
         /// At most 512 bytes.
         bytes: Vec<u8>,
     },
-    /// This peer is not dialled, and why. Said once a peer; after 32 of them one a second.
+    /// This peer is not dialled; the mismatch is the reason. Reported once for each peer; after 32 peers, one a second.
     Mismatch(PeerMismatch),
     /// The addresses that the names of static peers have.
     Named(BTreeMap<String, Vec<IpAddr>>),
-    /// Nothing was heard of this peer for long, or it said goodbye.
+    /// No datagram of this peer arrived for long, or it said goodbye.
     Gone {
         /// Which.
         daemon: DaemonId,
@@ -107,13 +107,13 @@ pub(crate) enum DiscoveryAction {
 pub(crate) struct PeerMismatch {
     /// The peer, as it calls itself.
     pub peer: DaemonId,
-    /// Where its beacon came from.
+    /// The source address of its beacon.
     pub address: SocketAddr,
     /// The variable to look at.
     pub setting: &'static str,
     /// This daemon's value.
     pub ours: String,
-    /// The peer's value, as it says.
+    /// The value that the peer states.
     pub theirs: String,
 }
 

@@ -23,29 +23,29 @@ use super::{
 
 use crate::token_bucket::TokenBucket;
 
-/// How often interfaces are looked at.
+/// Time between two scans of the network interfaces.
 const INTERFACES_EVERY: Duration = Duration::from_secs(3);
-/// How often names of listed peers are looked up.
+/// Time between two look-ups of the names of listed peers.
 const NAMES_EVERY: Duration = Duration::from_secs(30);
 const NAME_TIMEOUT: Duration = Duration::from_secs(5);
-/// Most datagrams that are looked at before what came of them is done.
+/// Maximum number of datagrams that are handled before the resulting actions are carried out.
 const TOGETHER: usize = 64;
-/// The same at the shared port: more than its buffer holds.
+/// The same limit for the shared port: more than its buffer holds.
 const TOGETHER_SHARED: usize = 512;
-/// Datagrams at the shared port that are looked at as they come, at once and each second. Of others those of this time
-/// are looked at together.
+/// Rate at which single datagrams of the shared port are handled as they come: burst, and number each second. Beyond
+/// it, the datagrams of one `REST` are handled together.
 const DATAGRAM_BURST: (u32, u32) = (32, 16);
 const REST: Duration = Duration::from_millis(20);
 /// Most addresses of one name.
 const MOST_OF_A_NAME: usize = 4;
 
-/// What the daemon tells discovery.
+/// A message from the daemon to discovery.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub(crate) enum DiscoveryEvent {
     /// Datagrams came to the QUIC port whose first byte [is discovery's](super::is_discovery).
     Datagrams(Datagrams),
-    /// The QUIC port is bound. Discovery says nothing before.
+    /// The QUIC port is bound. Discovery sends nothing before.
     QuicPort(u16),
     /// A link stands, whichever side dialled it.
     LinkUp {
@@ -53,7 +53,7 @@ pub(crate) enum DiscoveryEvent {
         daemon: DaemonId,
         /// At this address.
         address: SocketAddr,
-        /// Whether it proved that the id is its own.
+        /// Whether the peer proved that the id is its own.
         proven: bool,
     },
     /// The last link with a daemon is gone.
@@ -61,30 +61,30 @@ pub(crate) enum DiscoveryEvent {
         /// Which.
         daemon: DaemonId,
     },
-    /// Whether the path of a link carries anything.
+    /// A report whether the path of a link works.
     Path {
         /// With this daemon.
         daemon: DaemonId,
-        /// Whether it does.
+        /// Whether the path works.
         works: bool,
     },
     /// An [`DiscoveryAction::Dial`] became no link.
     DialFailed {
-        /// To whom.
+        /// The id of the dialled daemon.
         daemon: DaemonId,
-        /// As the action said it.
+        /// The standing, as in the action.
         standing: AddressConfidence,
     },
     /// The graph has a new digest.
     GraphDigest(u64),
 }
 
-/// Discovers as far as is `wanted`, until `events` closes; then says goodbye and ends, which closes
+/// Discovers within the limits of `wanted` until `events` closes. Then it says goodbye and ends, which closes
 /// `actions`.
 ///
-/// Never waits for `actions` to have room: a datagram that finds none is lost, a dial counts as
-/// failed. No failure of a socket, an interface or a name ends it; what cannot work is logged, and
-/// the rest goes on. Dropping the future is safe, and says no goodbye.
+/// Never waits for `actions` to have room: a datagram that finds no room is lost, and a dial counts as failed. No
+/// failure of a socket, an interface or a name ends it; the failure is logged, and the rest goes on. Dropping the
+/// future is safe, and says no goodbye.
 pub(crate) async fn run(
     config: &Config,
     daemon: DaemonId,
@@ -100,7 +100,8 @@ pub(crate) async fn run(
     let mut lookups = JoinSet::new();
     let mut hosts = BTreeSet::new();
     let mut range = DiscoveryRange::Off;
-    // Until when datagrams stay at the shared port, so that those of a flood are looked at together.
+    // While this is set, datagrams wait at the shared port until this time, so that those of a flood are handled
+    // together.
     let mut rest: Option<Instant> = None;
     wanted.mark_changed();
 
@@ -112,7 +113,7 @@ pub(crate) async fn run(
             event = events.recv() => match event {
                 Some(event) => {
                     shell.event(event);
-                    // What more there is now is looked at together.
+                    // Events that are already queued are handled together.
                     let more = std::iter::from_fn(|| events.try_recv().ok());
                     more.take(TOGETHER).for_each(|event| shell.event(event));
                 }
@@ -133,7 +134,7 @@ pub(crate) async fn run(
                 shell.set_range(range);
                 if hosts != now.hosts {
                     hosts = now.hosts;
-                    // Once the one that is under way is over, with what is wanted by then.
+                    // The next look-up starts after the current one has ended, with the needs of that time.
                     names.reset_immediately();
                 }
                 if range != DiscoveryRange::Off {
@@ -164,16 +165,16 @@ struct DiscoveryIo {
     start: Instant,
     peers: PeerDiscovery,
     socket: Option<SharedSocket>,
-    /// What may be looked at there at once.
+    /// The budget of datagrams of the shared port that may be handled at once.
     at_once: TokenBucket,
     /// Whether the shared port is used at all.
     multicast: bool,
     domain: u32,
     bind: Vec<IpAddr>,
     actions: mpsc::Sender<DiscoveryAction>,
-    /// The addresses of static peers. A name keeps those that it had while its look-up fails.
+    /// The addresses of static peers. A name keeps its last addresses while its look-up fails.
     names: BTreeMap<String, Vec<IpAddr>>,
-    /// The last failure to open the shared port, so that it is said once.
+    /// Whether the last attempt to open the shared port failed, so that the failure is logged once.
     complained: bool,
 }
 
@@ -221,8 +222,8 @@ impl DiscoveryIo {
         let _ = self.actions.try_send(DiscoveryAction::Named(names));
     }
 
-    /// A datagram came to the shared port: it is looked at, with those that wait there. Returns whether these were so
-    /// many that others may wait.
+    /// Handles a datagram of the shared port, together with the datagrams that wait there. Returns whether they were so
+    /// many that later ones may wait.
     fn heard(&mut self, from: SocketAddr, bytes: &[u8]) -> bool {
         let now = self.start.elapsed();
         self.peers.handle_datagram(now, from, Arrival::Shared, bytes);
@@ -313,7 +314,7 @@ async fn receive(socket: Option<&SharedSocket>) -> std::io::Result<(SocketAddr, 
     }
 }
 
-/// Where nobody is looked for, interfaces that change are no reason to wake up.
+/// Returns whether discovery looks for any peer. Otherwise a change of interfaces is no reason to wake up.
 fn looks_for_somebody(range: DiscoveryRange, hosts: &BTreeSet<(String, Option<u16>)>) -> bool {
     match range {
         DiscoveryRange::Off => false,

@@ -34,7 +34,7 @@ pub(crate) struct SharedSocket {
 struct DatagramSender {
     interface: Interface,
     from: Ipv4Addr,
-    /// Not tokio's, which would not send before it once waited for readiness. It never blocks.
+    /// This is not tokio's socket, which sends nothing before it has waited for readiness once. It never blocks.
     socket: std::net::UdpSocket,
     /// Multicast failed here before; broadcast is tried after it.
     failing: bool,
@@ -46,7 +46,7 @@ impl SharedSocket {
     pub(crate) fn open(domain: u32, bind: &[IpAddr]) -> io::Result<Self> {
         let group = shared_group(domain);
         let socket = udp()?;
-        // Not SO_REUSEPORT: that would ask all daemons to have one user.
+        // SO_REUSEPORT would not do: it requires that all daemons have the same user.
         socket.set_reuse_address(true)?;
         // Members of the group on this socket's own account only, not on other sockets'.
         socket.set_multicast_all_v4(false)?;
@@ -60,16 +60,16 @@ impl SharedSocket {
         })
     }
 
-    /// Joins and sends on these interfaces, as far as the bound addresses permit, and no longer on
-    /// others. What fails is logged; the rest goes on.
+    /// Joins the group and sends on these interfaces, as far as the bound addresses permit, and no longer on others.
+    /// Failures are logged and do not affect the other interfaces.
     pub(crate) fn follow(&mut self, interfaces: &[Interface]) {
         let wanted = permitted(&self.bind, interfaces);
         let kept = |interface: &Interface, from| {
             wanted.iter().any(|(i, address)| i == interface && *address == from)
         };
         self.senders.retain(|sender| kept(&sender.interface, sender.from));
-        // The kernel ends a membership with its interface; one that came back has a new number, or
-        // joining anew says "in use".
+        // The kernel ends a membership with its interface. An interface that came back has a new number, or a new join
+        // returns "in use".
         self.joined.retain(|index| wanted.iter().any(|(interface, _)| interface.index == *index));
         for (interface, from) in wanted.into_iter().take(MOST_SENDERS) {
             if !self.joined.contains(&interface.index) {
@@ -98,16 +98,16 @@ impl SharedSocket {
         Ok((from, buffer[..length].to_vec()))
     }
 
-    /// As [`receive`](Self::receive), if a datagram waits.
+    /// Returns a waiting datagram, if there is one; does not wait like [`receive`](Self::receive).
     pub(crate) fn try_receive(&self) -> Option<(SocketAddr, Vec<u8>)> {
         let mut buffer = [0; LONGEST + 1];
-        // An error is said by the next call that waits.
+        // The next call that waits returns an error of the socket.
         let (length, from) = self.receiver.try_recv_from(&mut buffer).ok()?;
         Some((from, buffer[..length].to_vec()))
     }
 
-    /// Sends to the group on every interface that is followed, by broadcast where multicast fails.
-    /// Never waits: what the kernel does not take at once is lost, as a datagram may be.
+    /// Sends to the group on every followed interface, by broadcast where multicast fails. Never waits: a datagram that
+    /// the kernel does not take at once is lost.
     pub(crate) fn send(&mut self, bytes: &[u8]) {
         for sender in &mut self.senders {
             sender.send(self.group, bytes);
@@ -136,7 +136,7 @@ impl DatagramSender {
     }
 
     fn send(&mut self, group: SocketAddrV4, bytes: &[u8]) {
-        // A socket says the failure of an earlier datagram once, before it sends the next.
+        // A socket returns the failure of an earlier datagram once, before it sends the next.
         let try_twice = |to: SocketAddrV4| {
             let send = || self.socket.send_to(bytes, to);
             send().or_else(|_| send())
@@ -157,8 +157,8 @@ impl DatagramSender {
     }
 }
 
-/// The interfaces to use, each with the address to send from: those of the bound addresses, or all
-/// but loopback. A bound loopback address need not be an interface's own: all of 127.0.0.0/8 is.
+/// Returns the interfaces to use, each with the address to send from: the interfaces of the bound addresses, or all but
+/// loopback. A bound loopback address need not be an interface's own: the loopback interface has all of 127.0.0.0/8.
 fn permitted(bind: &[IpAddr], interfaces: &[Interface]) -> Vec<(Interface, Ipv4Addr)> {
     let v4 = |interface: &Interface| match interface.address {
         IpAddr::V4(v4) => Some(v4),

@@ -60,7 +60,7 @@ impl Daemon {
     }
 }
 
-/// What a gateway does for discovery, until discovery ends.
+/// Carries out discovery's actions as a gateway does, until discovery ends.
 async fn carry(
     quic: UdpSocket,
     events: mpsc::WeakSender<DiscoveryEvent>,
@@ -123,7 +123,7 @@ async fn two_daemons_find_each_other_by_multicast_and_part_with_a_goodbye() {
 
 #[tokio::test]
 async fn listed_daemons_find_each_other_without_multicast_and_say_why_they_do_not_link() {
-    // This range does without multicast.
+    // The LOCALHOST range works without multicast.
     let a = config(
         212,
         &[

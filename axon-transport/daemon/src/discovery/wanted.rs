@@ -10,7 +10,7 @@ use axon_transport::{
 /// Most hosts that are looked for by address or name.
 const MOST_HOSTS: usize = 128;
 
-/// What the sessions of a daemon need of discovery together.
+/// The discovery that the sessions of a daemon need together.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct DiscoveryNeeds {
     /// The widest range of any: multicast in SUBNET alone, silence in OFF.
@@ -20,10 +20,10 @@ pub(crate) struct DiscoveryNeeds {
 }
 
 impl DiscoveryNeeds {
-    /// What sessions with the given `scopes` need. A daemon without a session does what its own settings say,
-    /// so that one that was started by hand is linked before its first session comes.
+    /// Returns the needs of sessions with the given `scopes`. A daemon without a session follows its own settings, so
+    /// that a daemon that was started by hand has its links before its first session comes.
     ///
-    /// `AXON_DAEMON_PEERS` says where else to look for peers of SUBNET sessions; it widens no range.
+    /// `AXON_DAEMON_PEERS` lists more hosts on which to look for peers of SUBNET sessions; it widens no range.
     pub(crate) fn of<'a>(config: &Config, scopes: impl IntoIterator<Item = &'a Scope>) -> Self {
         let mut range = None;
         let mut hosts: BTreeSet<(String, Option<u16>)> = BTreeSet::new();

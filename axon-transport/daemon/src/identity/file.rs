@@ -41,15 +41,15 @@ impl NamedFile {
         }
     }
 
-    /// How the file is now; why it cannot be used if that shows from outside.
+    /// Returns the current stamp of the file, or the reason why its metadata makes it unusable.
     pub(super) fn stamp(&self) -> Result<FileStamp, String> {
         self.demands.stamp(&self.path)
     }
 
-    /// The whole file, into a buffer that never moves and is erased.
+    /// Reads the whole file into a buffer that never moves and is erased.
     ///
     /// # Errors
-    /// It is not what the settings demand of it, cannot be read, or is too large.
+    /// The file does not meet the requirements of the settings, cannot be read, or is too large.
     pub(super) fn read(&self) -> Result<Zeroizing<Vec<u8>>, GatewayError> {
         self.demands.read(&self.path).map_err(|reason| self.unusable(reason))
     }

@@ -1,4 +1,4 @@
-//! From files to an identity.
+//! Loads an identity from files.
 
 use std::sync::Arc;
 
@@ -59,7 +59,7 @@ impl IdentityFiles {
         }
     }
 
-    /// Reads them all. `before` is what they said the last time: connections in the making know its
+    /// Reads all files. `before` is the identity that they gave the last time: handshakes in progress refer to its
     /// pins.
     ///
     /// # Errors
@@ -120,8 +120,8 @@ impl IdentityFiles {
         })
     }
 
-    /// What this host is called in HELLO under `auth`: `node`, its own name; in `ca` a name that its
-    /// certificate has, since peers accept no other.
+    /// Returns the name of this host in HELLO under `auth`: `node`, its own name; in `ca` a name in its certificate,
+    /// since peers accept no other.
     ///
     /// # Errors
     /// The certificate names several hosts, or none, and none of them is `node`.
@@ -143,7 +143,7 @@ impl IdentityFiles {
         }
     }
 
-    /// The same for later files: peers know this host by its name.
+    /// Checks that later files still give this host its name, by which peers know it.
     ///
     /// # Errors
     /// Its certificate no longer has that name.
@@ -162,7 +162,7 @@ impl IdentityFiles {
     }
 }
 
-/// What the files say.
+/// The identity that the files define.
 pub(super) struct Loaded {
     auth: Auth,
     pins: Option<TrustFile>,
@@ -174,7 +174,7 @@ impl Loaded {
         &self.auth
     }
 
-    /// From here on it holds, also for handshakes that have begun.
+    /// Puts the identity in force, also for handshakes that have begun.
     pub(super) fn put_in_force(self) -> Auth {
         if let (Auth::Pinned { trust, .. }, Some(pins)) = (&self.auth, self.pins) {
             trust.replace(pins);

@@ -23,15 +23,15 @@ use self::{
 };
 use crate::error::GatewayError;
 
-/// Whether the files that `classic` names can be used.
+/// Checks whether the files that `classic` names can be used.
 ///
 /// # Errors
-/// A file that cannot, by the name of its variable.
+/// A file that cannot be used, by the name of its variable.
 pub(crate) fn check(classic: &ClassicConfig) -> Result<(), GatewayError> {
     IdentityFiles::of(classic)?.load(None).map(drop)
 }
 
-/// What this host is, and whom it trusts, as its files say.
+/// This host's identity and the peers that it trusts, as its files define them.
 pub(crate) struct Identity {
     sources: IdentityFiles,
     host: String,
@@ -41,19 +41,18 @@ pub(crate) struct Identity {
 
 struct InForce {
     auth: Auth,
-    /// Why nobody new is let in.
+    /// The reason why no new peer is accepted.
     closed: Option<String>,
 }
 
 impl Identity {
-    /// Reads what `classic` names; an ephemeral key for `none`. `node` is this host's own name.
+    /// Reads the files that `classic` names; makes an ephemeral key for `none`. `node` is this host's own name.
     ///
     /// # Errors
-    /// A file that cannot be used, by the name of its variable; or a certificate that does not say
-    /// which host this is.
+    /// A file that cannot be used, by the name of its variable; or a certificate that does not say which host this is.
     pub(crate) fn load(classic: &ClassicConfig, node: &str) -> Result<Self, GatewayError> {
         let sources = IdentityFiles::of(classic)?;
-        // Before they are read: what is written meanwhile is read again.
+        // The watch begins before the files are read: a file that is written meanwhile is read again.
         let watch = FileWatcher::new(sources.files());
         let auth = sources.load(None)?.put_in_force();
         let host = sources.host(&auth, node)?;
@@ -61,22 +60,22 @@ impl Identity {
         Ok(Self { sources, host, in_force, watch: Mutex::new(watch) })
     }
 
-    /// What this host is called in HELLO.
+    /// Returns this host's name in HELLO.
     pub(crate) fn host(&self) -> &str {
         &self.host
     }
 
-    /// What is in force.
+    /// Returns the identity and the trust that are in force.
     pub(crate) fn auth(&self) -> Auth {
         self.in_force.read().unwrap_or_else(PoisonError::into_inner).auth.clone()
     }
 
-    /// Why nobody new is let in now, for people on this host.
+    /// Returns the reason why no new peer is accepted now, for people on this host.
     pub(crate) fn closed(&self) -> Option<String> {
         self.in_force.read().unwrap_or_else(PoisonError::into_inner).closed.clone()
     }
 
-    /// Whether there are files that can change.
+    /// Returns whether there are files that can change.
     pub(crate) fn has_files(&self) -> bool {
         !lock(&self.watch).is_empty()
     }

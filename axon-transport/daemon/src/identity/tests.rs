@@ -10,7 +10,7 @@ use axon_transport::config::ClassicAuth;
 
 use super::*;
 
-/// A pinned host's files, and what looks at them.
+/// The files of a pinned host, and the identity that watches them.
 struct Host {
     dir: tempfile::TempDir,
     identity: Identity,
@@ -58,7 +58,7 @@ impl Host {
         self.identity.look(self.now)
     }
 
-    /// As many looks as a second has.
+    /// Looks at the files four times, as often as in a second. Returns whether a look saw a change.
     fn second(&mut self) -> bool {
         (0..4).map(|_| self.look()).filter(|changed| *changed).count() > 0
     }
@@ -99,7 +99,8 @@ fn two_writes_in_one_moment_are_told_apart() {
     let trust = host.file("trust");
     let moment = SystemTime::UNIX_EPOCH + Duration::from_secs(1_000_000_000);
     for byte in 2..50 {
-        // As fast as can be: nothing but the content differs, and a tick of the clock if that.
+        // Two writes follow each other as fast as possible: they differ only in the content, and at most by one tick of
+        // the clock.
         fs::write(&trust, line(byte % 9)).unwrap();
         host.look();
         fs::write(&trust, line(byte % 7)).unwrap();

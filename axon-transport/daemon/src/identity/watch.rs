@@ -4,29 +4,29 @@ use std::time::{Duration, Instant};
 
 use super::file::{FileStamp, NamedFile};
 
-/// Somebody who writes for so long is not waited for.
+/// Maximum time for which the watcher waits for a writer to finish.
 const LONGEST_WRITE: Duration = Duration::from_secs(5);
 
-/// What a look at the files says.
+/// The result of a look at the files.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum FilesChange {
-    /// They are as they were read.
+    /// The files are as they were when they were read.
     Same,
     /// One is being written.
     Changing,
     /// One is being written, and has been for too long.
     Restless,
-    /// They changed and are still: they are to be read.
+    /// The files changed and no longer change: they must be read.
     Changed,
 }
 
-/// Files, and what was seen of them.
+/// The watched files, and their stamps.
 #[derive(Debug)]
 pub(super) struct FileWatcher {
     files: Vec<NamedFile>,
-    /// As they were when they were read.
+    /// The stamps at the time when the files were read.
     read: Option<Vec<FileStamps>>,
-    /// As they were at the last look.
+    /// The stamps at the last look.
     seen: Vec<FileStamps>,
     restless_since: Option<Instant>,
 }
@@ -41,7 +41,7 @@ impl FileWatcher {
         Self { files, read: Some(seen.clone()), seen, restless_since: None }
     }
 
-    /// Whether there is anything to look at.
+    /// Returns whether no file is watched.
     pub(super) fn is_empty(&self) -> bool {
         self.files.is_empty()
     }
@@ -62,14 +62,14 @@ impl FileWatcher {
         if now.duration_since(*self.restless_since.get_or_insert(now)) < LONGEST_WRITE {
             return FilesChange::Changing;
         }
-        // Whatever they become, they are to be read then.
+        // The files must be read once they are still, even if their stamps return to the old ones.
         self.read = None;
         self.restless_since = Some(now);
         FilesChange::Restless
     }
 
-    /// They were read after a look said `Changed`. Whether they stayed the same meanwhile: if not,
-    /// what was read may be half of one and half of the other.
+    /// Called after a look returned `Changed` and the files were read. Returns whether the files stayed the same
+    /// meanwhile. If not, the caller may have read half of one version and half of another.
     pub(super) fn confirm(&mut self) -> bool {
         let seen = self.stamps();
         if seen != self.seen {

@@ -22,7 +22,7 @@ pub struct Exporters {
 }
 
 impl Exporters {
-    /// From the exporters labelled [`ENVELOPE_EXPORTER`] and [`READY_EXPORTER`].
+    /// Makes exporters from the secrets labelled [`ENVELOPE_EXPORTER`] and [`READY_EXPORTER`].
     #[cfg(test)]
     pub(crate) fn new(envelope: [u8; 32], ready: [u8; 32]) -> Self {
         let exporter = |bytes| Arc::new(Zeroizing::new(bytes));
@@ -36,7 +36,7 @@ impl Exporters {
     pub fn derive<E>(mut export: impl FnMut(&mut [u8], &[u8]) -> Result<(), E>) -> Result<Self, E> {
         let mut exporter = |label: &[u8]| {
             let mut exporter = Exporter::default();
-            // Nobody shares it yet, so that nothing is copied.
+            // No clone shares it yet, so `make_mut` copies nothing.
             export(&mut Arc::make_mut(&mut exporter)[..], label)?;
             Ok::<_, E>(exporter)
         };
@@ -62,7 +62,7 @@ mod tests {
         residue::left_on_the_stack,
     };
 
-    /// Where it is written to, and nowhere else.
+    /// Writes the exporter to `out`, and to no other place.
     fn export(out: &mut [u8], label: &[u8]) -> Result<(), Infallible> {
         for (at, byte) in out.iter_mut().enumerate() {
             *byte = black_box(at as u8).wrapping_mul(151) ^ label[9];

@@ -6,7 +6,7 @@ use axon_envelope::{KeyId, KmeKey};
 
 use super::request::{Answer, FailureKind, Fetched, KeyPurpose, KmeRequest, RequestFailure};
 
-/// How often a batch is asked for.
+/// Number of times that a batch is requested.
 const TRIES: u8 = 3;
 /// Time between two tries, at least.
 const TRY: Duration = Duration::from_secs(2);
@@ -37,7 +37,7 @@ struct KeyBatch {
     not_before: Duration,
 }
 
-/// How one key_ID ended.
+/// The outcome for one key_ID.
 pub(super) type FetchOutcome = (KeyId, Result<KmeKey, RequestFailure>);
 
 impl Fetches {
@@ -66,7 +66,7 @@ impl Fetches {
         Some(KmeRequest::Dec { master, key_ids, purpose })
     }
 
-    /// What became of the keys that `answer` settles; none where they are asked for again.
+    /// Returns the outcomes of the keys that `answer` settles. Returns none if the keys are requested again.
     pub(super) fn handle_answer(&mut self, now: Duration, answer: Answer) -> Vec<FetchOutcome> {
         let KmeRequest::Dec { key_ids, .. } = answer.request else { return Vec::new() };
         let Some(i) = self.in_flight.iter().position(|b| b.key_ids == key_ids) else {
@@ -119,7 +119,7 @@ impl Fetches {
     }
 }
 
-/// Each key_ID with its own key, whatever else the answer holds.
+/// Returns each key_ID with its own key. Other keys in the answer are ignored.
 fn given(asked: Vec<KeyId>, mut keys: Vec<(KeyId, KmeKey)>) -> Vec<FetchOutcome> {
     let outcome = |key_id: KeyId| match keys.iter().position(|(id, _)| *id == key_id) {
         Some(i) => (key_id, Ok(keys.swap_remove(i).1)),

@@ -15,7 +15,7 @@ pub fn compute(key: &KmeKey, key_id: &KeyId, ready: &[u8; 32]) -> [u8; LEN] {
     key.derive(|key| mac(key, key_id, ready).finalize().into_bytes().into())
 }
 
-/// Whether `proof` is that of [`compute`], in constant time.
+/// Returns whether `proof` equals the proof that [`compute`] returns. Compares in constant time.
 #[must_use]
 pub fn verify(key: &KmeKey, key_id: &KeyId, ready: &[u8; 32], proof: &[u8; LEN]) -> bool {
     key.derive(|key| mac(key, key_id, ready).verify_slice(proof).is_ok())

@@ -6,12 +6,12 @@ use axon_envelope::{KeyId, KmeKey};
 
 pub use etsi_qkd014::pool::Stock;
 
-/// What a key is fetched for.
+/// The purpose for which a key is fetched.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum KeyPurpose {
     /// A dialler's TLS external PSK.
     Bootstrap,
-    /// The same key at the server, for a handshake that named it.
+    /// The same key at the server, which fetches it for a handshake that named it.
     Accept,
     /// The proof of the client's name.
     Proof,
@@ -27,9 +27,9 @@ pub enum KmeRequest {
     Enc {
         /// The other SAE.
         slave: String,
-        /// How many keys.
+        /// Number of keys.
         number: u32,
-        /// What for.
+        /// The purpose of the keys.
         purpose: KeyPurpose,
     },
     /// `dec_keys`: the keys that `master` named.
@@ -38,10 +38,10 @@ pub enum KmeRequest {
         master: String,
         /// Their names.
         key_ids: Vec<KeyId>,
-        /// What for.
+        /// The purpose of the keys.
         purpose: KeyPurpose,
     },
-    /// `status`: what is in stock with `slave`.
+    /// `status`: asks for the number of keys in stock with `slave`.
     Status {
         /// The other SAE.
         slave: String,
@@ -51,18 +51,18 @@ pub enum KmeRequest {
 /// A [`KmeRequest`] and how it ended.
 #[derive(Debug)]
 pub struct Answer {
-    /// As it was asked.
+    /// The request, unchanged.
     pub request: KmeRequest,
-    /// From asking to the end.
+    /// Time from the request to its end.
     pub took: Duration,
-    /// What came of it.
+    /// The result of the request.
     pub outcome: Result<Fetched, RequestFailure>,
 }
 
-/// What a successful [`KmeRequest`] gave.
+/// The result of a successful [`KmeRequest`].
 pub enum Fetched {
-    /// Keys, in the order asked for. All that were asked for, or it is a [`RequestFailure`]; of
-    /// `enc_keys` for messages without those that were used before.
+    /// Keys, in the order of the request. Fewer keys than requested are a [`RequestFailure`], except that `enc_keys`
+    /// for messages leaves out keys that were used before.
     Keys(Vec<(KeyId, KmeKey)>),
     /// The answer to [`KmeRequest::Status`].
     Stock(Stock),
@@ -71,7 +71,7 @@ pub enum Fetched {
 /// Why a [`KmeRequest`] failed. Never holds anything of a key.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RequestFailure {
-    /// What can be done about it.
+    /// The class of the failure.
     pub kind: FailureKind,
     /// For log and status.
     pub text: String,
@@ -79,14 +79,14 @@ pub struct RequestFailure {
     pub retry_after: Option<Duration>,
 }
 
-/// What can be done about a [`RequestFailure`].
+/// The class of a [`RequestFailure`], which decides the reaction to it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum FailureKind {
     /// No connection; nothing was asked. Try later.
     Unreachable,
     /// The KME cannot serve it now; an empty store is one reason. Try later.
     Unavailable,
-    /// The KME knows no such key, or refuses such a request. Asking again is useless.
+    /// The KME knows no such key, or refuses the request. Repeating it is useless.
     Refused,
     /// The KME does not accept this SAE, or this host does not accept the KME: a matter of
     /// certificates.
@@ -95,9 +95,9 @@ pub enum FailureKind {
     Ambiguous,
     /// The KME gave keys whose key_IDs it had given before. They are not used.
     Repeated,
-    /// Too many calls are waiting; nothing was asked.
+    /// Too many calls are waiting; no request was sent.
     Busy,
-    /// This host could not even put the request.
+    /// This host could not even make the request.
     Invalid,
 }
 
@@ -118,7 +118,7 @@ impl fmt::Debug for Fetched {
 }
 
 impl FailureKind {
-    /// What a peer may know: nothing of where the KME is or what it said.
+    /// Returns the text that a peer may see: it does not contain where the KME is or what the KME answered.
     pub fn told(self) -> &'static str {
         match self {
             Self::Unreachable => "its KME is unreachable",
@@ -132,7 +132,7 @@ impl FailureKind {
         }
     }
 
-    /// Whether the same call may succeed later by itself.
+    /// Returns whether the same call may succeed later without a change by a person.
     pub fn is_transient(self) -> bool {
         matches!(self, Self::Unreachable | Self::Unavailable | Self::Ambiguous | Self::Busy)
     }

@@ -26,7 +26,7 @@ pub struct UsedKeys(Arc<Mutex<Used>>);
 struct Used {
     path: Option<PathBuf>,
     file: Option<Ledger>,
-    /// All since the start, whatever becomes of the file.
+    /// All key_IDs since the start, even if the file is lost.
     memory: Ledger,
     unwritten: VecDeque<String>,
     /// Why the file is not kept.
@@ -35,7 +35,7 @@ struct Used {
     tried: Option<Instant>,
 }
 
-/// How the record stands, for status.
+/// The state of the record, for status.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct UsedStatistics {
     /// The file.
@@ -52,8 +52,8 @@ impl UsedKeys {
         Self::with(None)
     }
 
-    /// In a file of `directory` for the daemon of `domain`, with mode 0600; without a directory, or
-    /// where the file cannot be kept, in memory, which is said. Blocks on the disk.
+    /// Opens the record in a file of `directory` for the daemon of `domain`, with mode 0600. Without a directory, or if
+    /// the file cannot be kept, the record is in memory, and the log says so. Blocks on the disk.
     pub fn open(directory: Option<&Path>, domain: u32) -> Self {
         let this = Self::with(directory.map(|dir| dir.join(format!("used-keys-{domain}"))));
         let mut used = this.used();
@@ -77,13 +77,12 @@ impl UsedKeys {
         })))
     }
 
-    /// Records key_IDs, and says of each whether it is new: only then may its key be used. Blocks on
-    /// the disk.
+    /// Records key_IDs, and returns for each whether it is new: only then may its key be used. Blocks on the disk.
     pub fn record(&self, key_ids: &[String]) -> Vec<bool> {
         self.used().record(key_ids)
     }
 
-    /// How it stands.
+    /// Returns the state of the record.
     pub fn statistics(&self) -> UsedStatistics {
         let used = self.used();
         UsedStatistics {

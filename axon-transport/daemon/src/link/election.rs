@@ -9,11 +9,12 @@ use super::order::Side;
 pub struct Candidate {
     /// Which end this side is.
     pub side: Side,
-    /// Whether it succeeds a link that is up (a new key, a new address).
+    /// Whether the connection is the successor of a link that is up (for a new key or a new address).
     pub successor: bool,
 }
 
-/// Whether `new` takes the place of `current` between `ours` and `peer`, as the lower id decides it.
+/// Returns whether `new` takes the place of `current` between the daemons `ours` and `peer`. The daemon with the lower
+/// id decides by the same rule.
 ///
 /// A successor always does: it was dialled on purpose. Otherwise the lower id's own dial stays,
 /// and of two dials by the same side the newer one, since a daemon dials again only when it gave

@@ -24,7 +24,7 @@ pub struct TermMismatch {
 }
 
 impl LinkHello {
-    /// What `config` says of this daemon.
+    /// Makes the HELLO of this daemon from `config`.
     pub fn new(config: &Config, daemon: DaemonId) -> Self {
         let SecurityTerms { mode, key_mode, kex, cipher, auth } = SecurityTerms::of(config);
         let sae = match &config.security {
@@ -54,7 +54,7 @@ impl LinkHello {
         }
     }
 
-    /// What both sides must have in common.
+    /// Returns the terms that both sides must have in common.
     fn terms(&self) -> SecurityTerms {
         SecurityTerms {
             mode: self.mode,
@@ -109,7 +109,7 @@ pub fn check(
         };
         return differ(code, difference.setting, difference.ours, difference.theirs);
     }
-    // In classic nobody proves an SAE, so nobody may claim one.
+    // In classic no peer proves an SAE, so no peer may claim one.
     if theirs.sae.as_deref() != psk_sae {
         let text = |sae: Option<&str>| sae.unwrap_or("absent").to_owned();
         let proven = format!("{} (by the PSK)", text(psk_sae));

@@ -40,7 +40,7 @@ enum OrderStep {
 pub struct MessageOrder {
     side: Side,
     qkd: bool,
-    /// Whether the peer is the one that elects.
+    /// Whether the peer is the electing side.
     peer_elects: bool,
     step: OrderStep,
     hello_seen: bool,
@@ -65,7 +65,7 @@ impl MessageOrder {
         }
     }
 
-    /// This side elected the connection, or the peer's ELECTED was accepted.
+    /// Records that this side elected the connection, or accepted the peer's ELECTED.
     pub fn elected(&mut self) {
         if matches!(self.step, OrderStep::Election | OrderStep::Standby) {
             self.step = OrderStep::Open;
@@ -79,15 +79,15 @@ impl MessageOrder {
         }
     }
 
-    /// Whether the link is open for graph, routes and data.
+    /// Returns whether the link is open for graph, routes and data.
     pub fn is_open(&self) -> bool {
         self.step == OrderStep::Open
     }
 
-    /// Whether `message` may come now.
+    /// Checks that `message` may come now.
     ///
     /// # Errors
-    /// [`OutOfOrder`]; the connection is then closed.
+    /// [`OutOfOrder`]; the caller then closes the connection.
     pub fn accept(&mut self, message: &LinkMessage) -> Result<(), OutOfOrder> {
         let allowed = match (message, self.step) {
             (LinkMessage::Hello(_), OrderStep::Hello) => {

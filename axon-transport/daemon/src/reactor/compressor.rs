@@ -23,7 +23,7 @@ impl CompressorThread {
         Self { orders: None, report }
     }
 
-    /// Has a sample compressed.
+    /// Orders the compression of a sample.
     pub(super) fn submit(&mut self, order: CompressionOrder) {
         let orders = self.orders.get_or_insert_with(|| start(self.report.clone()));
         if let Err(unsent) = orders.send(order) {

@@ -34,7 +34,7 @@ impl ControlOutbox {
         }
     }
 
-    /// Whether so many messages wait that the reactor should read nothing more from the network.
+    /// Returns whether so many messages wait that the reactor should stop reading from the network.
     pub(super) fn is_behind(&self) -> bool {
         self.waiting.len() >= CHANNEL
     }

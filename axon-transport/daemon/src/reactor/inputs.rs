@@ -1,4 +1,5 @@
-//! The inputs of the reactor besides datagrams: what woke the loop is kept here until the next pass takes it in.
+//! The inputs of the reactor besides datagrams: an input that woke the loop is kept here until the next pass takes it
+//! in.
 
 use std::{
     io,
@@ -75,7 +76,7 @@ impl Inputs {
         Ok(Self { orders, key_events, done, doorbell, rang: true, taken: Vec::new() })
     }
 
-    /// Whether the doorbell rang since the last call.
+    /// Returns whether the doorbell rang since the last call.
     pub(super) fn take_ring(&mut self) -> bool {
         std::mem::take(&mut self.rang)
     }

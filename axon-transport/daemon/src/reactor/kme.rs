@@ -12,8 +12,8 @@ use crate::{
     keys::{Events, Kme, UsedKeys},
 };
 
-/// How much of the stack is overwritten: more than a handshake takes below the tasks that it runs in, in builds without
-/// optimization too (`tests/tests/hosts/kme_keys.rs`).
+/// Number of bytes of the stack that are overwritten: more than a handshake takes below the tasks that it runs in, in
+/// builds without optimization too (`tests/tests/hosts/kme_keys.rs`).
 const STACK_DEPTH: usize = 384 << 10;
 
 /// The KME client and its thread.

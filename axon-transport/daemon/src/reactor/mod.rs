@@ -1,8 +1,8 @@
 //! The reactor: drives the [engine](crate::engine) with sockets, rings, clocks and the KME.
 //!
-//! One thread does all that concerns links. Each pass takes in what is ready, has the engine settle, sends its packets
-//! and carries out its effects. The KME client and the compression of samples have a thread each, and files are read and
-//! written on others.
+//! One thread does all the work of links. Each pass takes in the ready inputs, lets the engine settle, sends its
+//! packets and carries out its effects. The KME client and the compression of samples have a thread each, and files are
+//! read and written on others.
 
 mod bind;
 mod compressor;
@@ -54,7 +54,7 @@ use crate::{
     link::LinkHello,
 };
 
-/// Tasks on other threads, such as a write to the ledger of used keys, are waited for so long at the end.
+/// Maximum wait, at the end, for tasks on other threads, such as a write to the ledger of used keys.
 const LAST_TASKS: Duration = Duration::from_secs(1);
 
 /// Runs the gateway until the control plane shuts it down.
@@ -116,7 +116,7 @@ async fn serve(
         session: of_session,
         epoch_nanos: monotonic(),
     })?;
-    // An error: the control plane is gone, which the orders say, too.
+    // An error means that the control plane is gone; the channel of orders reports that as well.
     let _ = control.send(ToControl::Started { port }).await;
     let reactor = Reactor::new(ReactorParts {
         engine,

@@ -1,4 +1,4 @@
-//! The loop: passes that take in what is ready, and the wait between them.
+//! The loop: passes that take in the ready inputs, and the wait between passes.
 
 use std::{
     future::poll_fn,
@@ -39,13 +39,13 @@ use crate::{
     keys::{Events, Kme, KmeAnswer, UsedKeys},
 };
 
-/// Packets that one pass sends before it takes in what has come, in system calls.
+/// Maximum number of system calls that send packets in one pass, before the loop takes in new inputs.
 const MAX_SENDS: usize = 64;
 /// Between two looks at the files of the identity: a change is in force within a second.
 const IDENTITY_CHECK_INTERVAL: Duration = Duration::from_millis(250);
-/// How long the last packets of closed connections may take.
+/// Maximum time for the last packets of closed connections.
 const GOODBYE: Duration = Duration::from_millis(500);
-/// In a flood of discovery datagrams the thread sleeps so long and takes in what came meanwhile.
+/// Sleep of the thread in a flood of discovery datagrams; the next pass takes in the datagrams that came meanwhile.
 const REST: Duration = Duration::from_millis(2);
 /// Freed memory is given back to the system after this time.
 const RETURN: Duration = Duration::from_secs(1);
@@ -53,7 +53,7 @@ const RETURN: Duration = Duration::from_secs(1);
 /// The parts of a reactor.
 pub(super) struct ReactorParts {
     pub(super) engine: Engine,
-    /// Whether it looks for inputs before it sleeps.
+    /// Whether the reactor looks for inputs before it sleeps.
     pub(super) poll: LinkPoll,
     /// When the engine's time was zero.
     pub(super) epoch: Instant,
@@ -170,7 +170,7 @@ impl Reactor {
         let _ = tokio::time::timeout(GOODBYE, self.told.flush()).await;
     }
 
-    /// Takes in all that is ready, and does what follows. Returns whether there was anything.
+    /// Takes in all ready inputs and handles them. Returns whether there was any.
     fn pass(&mut self) -> bool {
         let now = self.now();
         let mut busy = self.take_in(now);
@@ -332,7 +332,7 @@ impl Reactor {
         }
     }
 
-    /// Has the counters of the keys read, on another thread: the ledger may wait for the disk.
+    /// Starts a read of the counters of the keys on another thread, because the ledger may wait for the disk.
     fn report_keys(&mut self, now: Duration) {
         let Some((kme, used)) = &self.kme else { return };
         if !self.key_reports.begin(now) {
@@ -347,7 +347,7 @@ impl Reactor {
     /// Waits until there is something to do. The pass before had work if it was `busy`.
     async fn wait(&mut self, busy: bool) {
         if std::mem::take(&mut self.is_flooded) && !busy {
-            // Not a wait for inputs: each datagram would end it. But for what is due.
+            // This does not wait for inputs: each datagram would end the wait. It ends early for a due timer.
             let now = self.now();
             let due = self.engine.poll_timeout(now).map_or(REST, |due| due.saturating_sub(now));
             std::thread::sleep(REST.min(due));
@@ -391,7 +391,7 @@ impl Reactor {
         }
     }
 
-    /// Whether there is an input now.
+    /// Returns whether there is an input now.
     async fn look(&mut self) -> bool {
         let Self { inputs, sockets, notices, told, .. } = self;
         let reads = !told.is_behind();

@@ -1,23 +1,23 @@
 //! Decides whether the reactor looks for the next input before it sleeps.
 //!
-//! To wake up costs more than an input that comes at once. To look costs processor time, and an input that is not about
-//! to come makes that a waste. So looking has to pay: its results are counted, and it stops while too few looks find an
-//! input.
+//! A wake-up costs more than a look that finds an input at once. A look costs processor time, which is wasted if no
+//! input comes. So the rule counts the results of looks, and stops looking while too few looks find an input.
 
 use std::time::Duration;
 
 use axon_transport::config::LinkPoll;
 
-/// How long one look lasts.
+/// Duration of one look.
 const POLL_TIME: Duration = Duration::from_micros(50);
 /// Looks that are judged together.
 const TRIAL: u32 = 16;
-/// At least one look in so many has to find an input.
+/// Divisor of the required hit rate: at least one look in this many has to find an input.
 const MIN_HIT_DIVISOR: u32 = 4;
-/// Passes without a look after a trial that did not pay, at first and at most. Each such trial doubles them.
+/// Passes without a look after a trial with too few hits: the first number, and the maximum. Each such trial doubles
+/// the number.
 const SKIPPED_PASSES: (u32, u32) = (64, 4096);
 
-/// What the reactor does after a pass.
+/// The reactor's action after a pass.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum PollDecision {
     /// It sleeps.
@@ -28,7 +28,7 @@ pub(super) enum PollDecision {
     On,
 }
 
-/// The rule, and what looking brought.
+/// The rule, and the results of its looks.
 #[derive(Debug)]
 pub(super) struct PollRule {
     poll: LinkPoll,
@@ -42,7 +42,8 @@ pub(super) struct PollRule {
 }
 
 impl PollRule {
-    /// Nothing was looked for yet. On a host with one processor a look would keep the sender of the input from it.
+    /// Creates a rule that has not looked yet. On a host with one processor a look would keep the sender of the input
+    /// from running.
     pub(super) fn new(poll: LinkPoll, processors: usize) -> Self {
         let poll = match poll {
             LinkPoll::Adaptive if processors < 2 => LinkPoll::Never,
@@ -51,7 +52,7 @@ impl PollRule {
         Self { poll, made: 0, found: 0, skipped: 0, pause: SKIPPED_PASSES.0 }
     }
 
-    /// What to do after a pass, which had work if it was `busy`.
+    /// Returns the action after a pass; `busy` says whether the pass had work.
     pub(super) fn after_pass(&mut self, busy: bool) -> PollDecision {
         match self.poll {
             LinkPoll::Always => PollDecision::On,
@@ -86,7 +87,8 @@ impl PollRule {
 mod tests {
     use super::*;
 
-    /// Looks made in so many busy passes, the input following a look in time if `comes` says so.
+    /// Returns the number of looks made in `passes` busy passes. `comes` says whether an input follows in time for the
+    /// look of a pass.
     fn looks(looks: &mut PollRule, passes: u32, comes: impl Fn(u32) -> bool) -> u32 {
         let mut made = 0;
         for pass in 0..passes {

@@ -23,7 +23,7 @@ use crate::{engine::quic::qlog::Qlogs, link::Side};
 const MAX_FILE_BYTES: usize = 16 << 20;
 /// Files in the directory. The oldest goes for a new one.
 const MAX_FILES: usize = 64;
-/// A connection hands on its events when there are so many bytes.
+/// Number of bytes at which a connection passes its events on.
 const TOGETHER: usize = 16 << 10;
 /// Orders that wait for the disk.
 const QUEUE: usize = 256;
@@ -35,7 +35,7 @@ enum QlogOrder {
     Open(u64, String),
     /// Append whole records.
     Write(u64, Vec<u8>),
-    /// Nothing more comes.
+    /// No more events follow for this connection.
     Close(u64),
 }
 
@@ -69,7 +69,7 @@ impl QlogFiles {
 impl LastWrites {
     /// Waits until all is written that was handed on, but no longer than this. All writers are gone.
     pub(super) fn wait(self, most: Duration) {
-        // Either error says that the wait is over.
+        // Either error means that the wait is over.
         let _ = self.0.recv_timeout(most);
     }
 }

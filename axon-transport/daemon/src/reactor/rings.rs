@@ -35,7 +35,7 @@ impl ShmRings {
     /// # Errors
     /// The session's doorbell is taken.
     pub(super) fn new(session: Session) -> Result<Rc<Self>, ShmError> {
-        // Before there is any reader: the engine looks at those that have something to take, and at no others.
+        // This precedes the first reader: the engine then looks only at readers that have a sample to take.
         session.segment().follow();
         Ok(Rc::new(Self {
             doorbell: session.segment().external_leader()?,
@@ -50,7 +50,7 @@ impl ShmRings {
         &self.doorbell
     }
 
-    /// Arms the doorbell. What came before it is found by a look at the rings, what comes after it rings.
+    /// Arms the doorbell. A look at the rings finds samples that came before; samples that come after ring it.
     pub(super) fn arm(&self) {
         let room = self.waits_for_room.get();
         self.doorbell.clear();
@@ -58,7 +58,7 @@ impl ShmRings {
         self.armed_for_room.set(room);
     }
 
-    /// Whether the engine waits for room since the doorbell was armed: it has to be armed again.
+    /// Returns whether the engine began to wait for room after the doorbell was armed: it has to be armed again.
     pub(super) fn is_armed_too_little(&self) -> bool {
         self.waits_for_room.get() && !self.armed_for_room.get()
     }
@@ -211,8 +211,8 @@ impl RingWriter for StandInWriter {
     fn try_write(&self, client: &Gid, meta: Meta, payload: &[u8]) -> Result<Written, RingError> {
         self.0.try_write_quietly(client, meta, payload).map_err(|error| match error {
             PublishError::Blocked { .. } => RingError::Full,
-            // One that fits in no state of the other rings is lost like any that is too long. Whether one fits in the end that
-            // is a little shorter is for them to say, so the engine does not wait for ever.
+            // A sample that needs at most half of the memory budget may fit later. A longer one may fit in no state of
+            // the other rings. It is lost like one that is too long, so that the engine does not wait for ever.
             error @ PublishError::MemoryBudget { needed, most, .. } if needed <= most / 2 => {
                 RingError::Short(error.to_string())
             }

@@ -32,17 +32,17 @@ impl Notices {
         self.wake.notify_one();
     }
 
-    /// Whether the graph changed since it was taken.
+    /// Returns whether the graph changed since it was taken.
     pub(super) fn has_graph(&self) -> bool {
         self.graph.load(Ordering::Acquire)
     }
 
-    /// Whether the graph changed since the last call.
+    /// Returns whether the graph changed since the last call, and clears the flag.
     pub(super) fn take_graph(&self) -> bool {
         self.graph.swap(false, Ordering::AcqRel)
     }
 
-    /// Whether the control plane dropped the session.
+    /// Returns whether the control plane dropped the session.
     pub(super) fn is_lost(&self) -> bool {
         self.lost.load(Ordering::Acquire)
     }

@@ -16,7 +16,7 @@ pub(super) struct ShutdownDrain {
     released: usize,
     since: Duration,
     next: Duration,
-    /// Nothing waited at the last look.
+    /// Whether no byte waited at the last look.
     empty: bool,
 }
 
@@ -31,8 +31,9 @@ impl ShutdownDrain {
         self.next
     }
 
-    /// Whether it is over. `backlog` is what [`Engine::backlog`](crate::engine::Engine::backlog) returns. The waiting
-    /// bytes alone do not show progress, since publishers go on.
+    /// Returns whether the shutdown is over. `backlog` is the result of
+    /// [`Engine::backlog`](crate::engine::Engine::backlog). The number of waiting bytes alone does not show progress,
+    /// since publishers go on.
     pub(super) fn is_over(&mut self, backlog: (usize, usize), now: Duration) -> bool {
         let (waiting, released) = backlog;
         self.next = now + CHECK_INTERVAL;

@@ -14,13 +14,13 @@ use tokio::{io::Interest, net::UdpSocket};
 
 use crate::{error::EndpointError, reactor::bind::bind_daemon};
 
-/// Messages that one system call receives. Each holds as many datagrams as the kernel coalesced.
+/// Number of messages that one system call receives. Each holds as many datagrams as the kernel coalesced.
 const MESSAGES: usize = 8;
 /// The longest message.
 const MESSAGE: usize = 64 << 10;
-/// System calls that one pass receives with, for each socket.
+/// Maximum number of receiving system calls of one pass, for each socket.
 const CALLS: usize = 8;
-/// Bytes of one message that is sent: what an IP packet holds, less its headers.
+/// Maximum number of bytes of one sent message: the largest IP packet less its headers.
 const MAX_SENT: usize = 65_000;
 
 /// A datagram that was received.

@@ -27,11 +27,11 @@ const LONGEST_SAE_ID: usize = 63;
 pub enum Datagram {
     /// "Try me here".
     Beacon(Beacon),
-    /// A beacon of a daemon that speaks no protocol version of ours; nothing more is read of it.
+    /// A beacon of a daemon without a protocol version of ours; the rest of it is not read.
     Foreign(Foreign),
-    /// A daemon says that it ends.
+    /// A daemon announces that it ends.
     Goodbye {
-        /// Its domain.
+        /// The domain of the daemon.
         domain: u32,
         /// The one that ends.
         daemon: DaemonId,
@@ -40,7 +40,7 @@ pub enum Datagram {
     Probe {
         /// The sender.
         daemon: DaemonId,
-        /// To be repeated.
+        /// The nonce that the answer repeats.
         nonce: [u8; 8],
     },
     /// Answers a [`Probe`](Self::Probe).
@@ -52,7 +52,7 @@ pub enum Datagram {
     },
 }
 
-/// What a daemon says of itself. Neither authenticated nor confidential.
+/// A daemon's description of itself. It is neither authenticated nor confidential.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Beacon {
     /// Lowest and highest protocol version spoken.
@@ -61,28 +61,28 @@ pub struct Beacon {
     pub domain: u32,
     /// The sender.
     pub daemon: DaemonId,
-    /// What it takes to link with it.
+    /// The security terms of its links.
     pub terms: SecurityTerms,
-    /// Its SAE ID in qkd: 1 to 63 visible ASCII characters.
+    /// The daemon's SAE ID in qkd: 1 to 63 visible ASCII characters.
     pub sae: Option<String>,
-    /// Its QUIC port, not 0.
+    /// The daemon's QUIC port, not 0.
     pub port: u16,
     /// Addresses that may lead to it, at most four.
     pub addresses: Vec<IpAddr>,
     /// Digest of its graph.
     pub graph: u64,
-    /// Whether the receiver is asked for its own beacon.
+    /// Whether the sender asks the receiver for its own beacon.
     pub answer_wanted: bool,
-    /// Whether it links within its host and with listed peers only.
+    /// Whether the daemon links only within its host and with listed peers.
     pub localhost: bool,
 }
 
-/// What is read of a beacon in an unknown protocol.
+/// The part that is read of a beacon in an unknown protocol.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Foreign {
     /// Lowest and highest protocol version spoken.
     pub protocols: (u8, u8),
-    /// Its domain.
+    /// The domain of the daemon.
     pub domain: u32,
     /// The sender.
     pub daemon: DaemonId,
@@ -297,7 +297,7 @@ impl Beacon {
         let visible = |sae: &str| {
             (1..=LONGEST_SAE_ID).contains(&sae.len()) && sae.bytes().all(|b| b.is_ascii_graphic())
         };
-        // In qkd nobody can be dialled without a name for the KME.
+        // In qkd a daemon cannot be dialled without a name for the KME.
         if wire.sae.map_or(terms.mode == SecurityTerms::QKD, |sae| !visible(sae)) {
             return Err(DatagramError::Key(8));
         }

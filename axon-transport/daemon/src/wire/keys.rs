@@ -22,29 +22,29 @@ const RETIRE: u8 = 19;
 /// One key announcement.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum KeyMessage {
-    /// From a sender: these are to be fetched. 1 to [`MAX_ANNOUNCED`].
+    /// From a sender: the receiver should fetch these keys. 1 to [`MAX_ANNOUNCED`].
     Announce(Vec<KeyId>),
-    /// From a receiver: this one is held and may be sealed under.
+    /// From a receiver: it holds this key, and the sender may seal under it.
     Ready {
         /// The key.
         key_id: KeyId,
-        /// Its proof, see `keys::proof`.
+        /// The proof of the receiver, see `keys::proof`.
         proof: [u8; PROOF_LEN],
     },
-    /// From a receiver: this one cannot be had.
+    /// From a receiver: it cannot get this key.
     Failed {
         /// The key.
         key_id: KeyId,
         /// Why, for log and status.
         reason: String,
     },
-    /// From a sender: no more is sealed under this one.
+    /// From a sender: it seals nothing more under this key.
     Retire {
         /// The key.
         key_id: KeyId,
         /// Indexes that were sealed.
         used: IndexMask,
-        /// Those of them that went on reliable streams.
+        /// The used indices that went on reliable streams.
         reliable: IndexMask,
     },
 }
@@ -56,7 +56,7 @@ pub enum MessageError {
     /// The frame type is another one's.
     #[error("frame type {0} is no key announcement")]
     Type(u8),
-    /// Not one CBOR map with integer keys.
+    /// The bytes are not one CBOR map with integer keys.
     #[error("malformed CBOR: {0}")]
     Cbor(String),
     /// A key of the map that is needed is absent.
@@ -76,11 +76,11 @@ impl From<minicbor::decode::Error> for MessageError {
     }
 }
 
-/// What a peer did against the rules for key announcements. The link is closed for it.
+/// A violation of the rules for key announcements by a peer. The link is closed for it.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum KeyViolation {
-    /// RETIRE with masks that contradict each other, or what has opened.
+    /// RETIRE with masks that contradict each other, or the messages that were opened.
     #[error("RETIRE for key_ID {0}: {1}")]
     Masks(KeyId, String),
     /// A message that has no place here.
@@ -149,7 +149,7 @@ impl KeyMessage {
     /// Reads the CBOR map behind a frame's type byte. Unknown keys are skipped.
     ///
     /// # Errors
-    /// [`MessageError`], for any bytes that are not such a map, or exceed its bounds.
+    /// [`MessageError`], for any bytes that are not a map of this format, or exceed its bounds.
     pub fn decode(frame_type: u8, map: &[u8]) -> Result<Self, MessageError> {
         let mut fields = Fields::default();
         let mut d = Decoder::new(map);
@@ -209,8 +209,7 @@ impl KeyMessage {
 
 #[derive(Default)]
 struct Fields {
-    /// Bit i: key i was read. Keys of eight and more are nobody's, and skipped however often they
-    /// come.
+    /// Bit i: key i was read. No key of eight or more is defined; such keys are skipped, even if they are repeated.
     seen: u8,
     key_ids: Vec<KeyId>,
     key_id: Option<KeyId>,
@@ -231,7 +230,7 @@ fn text(key_id: &KeyId) -> &str {
         .expect("key_IDs are checked to be text before they are announced")
 }
 
-/// As much of a reason as the format takes, cut between characters.
+/// Returns the longest prefix of a reason that the format permits, cut between characters.
 fn shortened(reason: &str) -> &str {
     let fits = (0..=MAX_REASON.min(reason.len())).rev().find(|&i| reason.is_char_boundary(i));
     &reason[..fits.unwrap_or(0)]

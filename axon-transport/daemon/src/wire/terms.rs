@@ -27,7 +27,7 @@ pub struct Difference {
     pub setting: &'static str,
     /// This daemon's value.
     pub ours: String,
-    /// The peer's value, as it says.
+    /// The value that the peer states.
     pub theirs: String,
 }
 
@@ -41,7 +41,7 @@ impl SecurityTerms {
     /// The code of `qkd` in [`mode`](Self::mode).
     pub const QKD: u8 = 1;
 
-    /// What a daemon with this configuration states.
+    /// Returns the terms of a daemon with this configuration.
     pub fn of(config: &Config) -> Self {
         let cipher = match config.cipher {
             QuicCipher::ChaCha20Poly1305 => 0,
@@ -70,7 +70,7 @@ impl SecurityTerms {
         }
     }
 
-    /// The first setting in which the two differ, the one that explains most first.
+    /// Returns the first setting in which the two differ. The most informative setting is compared first.
     ///
     /// ```
     /// use axon_daemon::internal::wire::SecurityTerms;

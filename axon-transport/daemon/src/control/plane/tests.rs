@@ -33,7 +33,7 @@ fn link(control: &mut ControlPlane) {
     control.gateway_says(ToControl::Link(Box::new(status), vec![refused]));
 }
 
-/// How often the session is told that a route does not cross.
+/// Returns the number of REFUSED messages that are queued for the session.
 fn told(control: &mut ControlPlane) -> usize {
     let packets = std::iter::from_fn(|| control.registry.poll_output(&SESSION));
     packets

@@ -11,7 +11,7 @@ use rustix::{
 
 use super::*;
 
-/// Only what was lost takes this long.
+/// Timeout of a wait; only a lost message takes this long.
 const EVER: Duration = Duration::from_secs(60);
 
 fn pair() -> [OwnedFd; 2] {
@@ -23,7 +23,7 @@ fn say(socket: &OwnedFd, message: &SessionMessage) {
     socket::send(socket, &message.encode().unwrap(), &[]).unwrap();
 }
 
-/// The next message of those that `pick` wants.
+/// Waits for the next message that `pick` accepts.
 #[track_caller]
 fn hear<T>(socket: &OwnedFd, mut pick: impl FnMut(SessionMessage) -> Option<T>) -> T {
     loop {

@@ -12,7 +12,7 @@ use axon_transport::{
 use super::{super::plane::ControlPlane, questions::NOT_LINKED};
 
 impl ControlPlane {
-    /// Handles a session's question what a peer lets this host do. Other users may not ask.
+    /// Handles a session's question about what a peer lets this host do. Other users may not ask.
     pub(in crate::control) fn ask_decisions(&mut self, id: &SessionId, check: AccessCheck) {
         let user = self.registry.session(id).and_then(|entry| entry.user);
         let AccessCheck { daemon, uses } = check;

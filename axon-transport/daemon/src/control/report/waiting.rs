@@ -89,7 +89,8 @@ impl NotifiedEndpoints {
         for (local, route) in all.filter(|(local, _)| is_own(local)) {
             let told = self.0.entry(peer.to_owned()).or_default();
             let gid = local.endpoint.gid;
-            // One that is told everything anew would not hear of it: it is told with the next report.
+            // The control plane is about to resend everything to such a session, which would not get this message; the
+            // next report sends it.
             if told.len() == MAX_WAITING_ENDPOINTS
                 || registry.is_told_anew(&local.session)
                 || !told.insert(gid)

@@ -57,7 +57,7 @@ impl PeerDiscovery {
         }
     }
 
-    /// Returns the sources of a peer's beacons, and what it advertises from there.
+    /// Returns the sources of a peer's beacons, and the addresses that it advertises from there.
     fn all_addresses(&self, record: &DaemonRecord) -> Vec<SocketAddr> {
         let sources: Vec<_> = record.sources.iter().map(|source| source.address).collect();
         let advertised = record.sources.iter().flat_map(|source| &source.advertised);

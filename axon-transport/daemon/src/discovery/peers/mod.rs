@@ -130,7 +130,7 @@ impl PeerDiscovery {
 
     /// Returns the next output, or `None` if there is none.
     pub(crate) fn poll_output(&mut self) -> Option<PeersOutput> {
-        // Once for all datagrams that arrived together.
+        // Dials are decided once for all datagrams that arrived together.
         if let Some(now) = self.dials_due.take() {
             self.dial_due(now);
         }

@@ -305,7 +305,7 @@ impl DaemonRecord {
         }
     }
 
-    /// Returns whether the peer said goodbye just now, and clears the goodbye.
+    /// Returns whether the peer said goodbye recently, and clears the goodbye.
     pub(super) fn left(&mut self, now: Duration) -> bool {
         self.leaving.take().is_some_and(|at| at + GOODBYE_COUNTS >= now)
     }
@@ -315,7 +315,7 @@ impl DaemonRecord {
         self.stayed.is_some_and(|at| at + GOODBYE_COUNTS > now)
     }
 
-    /// Returns when the peer counts as gone, unless it is heard before.
+    /// Returns when the peer counts as gone, unless a datagram of it arrives before.
     pub(super) fn gone_at(&self, lifetime: Duration) -> Duration {
         let silent = self.last_seen + lifetime;
         self.leaving.map_or(silent, |at| silent.min(at + ANSWER_WITHIN))

@@ -100,7 +100,7 @@ impl fmt::Display for Lookup {
 
 /// The keys with which this host accepts handshakes. The daemon has one acceptor; clones share it.
 ///
-/// Look-ups happen inside the TLS handshake, on whatever thread drives it. So all methods take `&self`, and the time
+/// Look-ups happen inside the TLS handshake, on the thread that drives it. So all methods take `&self`, and the time
 /// comes from a [`Clock`].
 #[derive(Clone)]
 pub struct Acceptor(Arc<AcceptorInner>);

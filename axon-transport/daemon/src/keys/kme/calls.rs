@@ -48,7 +48,7 @@ impl KmeCaller {
         };
         self.recorder.record(request, start.elapsed(), &outcome);
         let notice = {
-            // Says too much or too little at worst, whatever thread panicked over it.
+            // If a thread panicked while it held the lock, the log contains at worst too many or too few lines.
             let mut outages = self.outages.lock().unwrap_or_else(PoisonError::into_inner);
             let failure = repeated.as_ref().or(outcome.as_ref().err());
             outages.record(Instant::now(), request, failure)
@@ -61,8 +61,8 @@ impl KmeCaller {
         outcome
     }
 
-    /// Those of fresh `keys` that this host never had, and what is wrong with the others. Only
-    /// messages make do with some of those asked for.
+    /// Returns the fresh `keys` that this host never had, and a failure if it had others before. Only messages accept
+    /// fewer keys than were requested.
     async fn unused(
         &self,
         purpose: KeyPurpose,
@@ -72,7 +72,7 @@ impl KmeCaller {
             keys.iter().map(|(id, _)| String::from_utf8_lossy(id.as_bytes()).into()).collect();
         let used = self.used.clone();
         let recorded = tokio::task::spawn_blocking(move || used.record(&names)).await;
-        // The runtime ends: nobody is left to use a key.
+        // The runtime ends: no task is left that could use a key.
         let new = recorded.unwrap_or_else(|_| vec![false; keys.len()]);
         let mut again = None;
         let mut unused = Vec::with_capacity(keys.len());

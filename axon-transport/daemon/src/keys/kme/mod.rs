@@ -39,7 +39,7 @@ const LINK_CALLS: usize = 32;
 /// Calls in flight for messages.
 const MESSAGE_CALLS: usize = 16;
 
-/// Who asked, and so who gets the answer. The numbers are the caller's own.
+/// The origin of a request, which gets the answer. The caller chooses the numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum RequestOrigin {
     /// The [`BootstrapDialler`](super::BootstrapDialler).
@@ -56,10 +56,10 @@ pub enum RequestOrigin {
     Receiver(u64),
 }
 
-/// An answer, and who asked.
+/// An answer, with the origin of its request.
 #[derive(Debug)]
 pub struct KmeAnswer {
-    /// Who asked.
+    /// The origin of the request.
     pub origin: RequestOrigin,
     /// The answer.
     pub answer: Answer,
@@ -84,7 +84,7 @@ pub enum KmeError {
     Setting {
         /// The variable.
         variable: &'static str,
-        /// What is wrong with it and what is accepted.
+        /// The defect, and the accepted values.
         reason: String,
     },
 }
@@ -109,10 +109,10 @@ struct Job {
 }
 
 impl Kme {
-    /// Whether the settings make a client: URL, certificates, key and quirks. Opens no connection.
+    /// Checks that the settings make a client: URL, certificates, key and quirks. Opens no connection.
     ///
     /// # Errors
-    /// The variable that is wrong, and how.
+    /// The wrong variable, and its defect.
     pub fn check(config: &QkdConfig) -> Result<(), KmeError> {
         client(config).map(drop)
     }
@@ -176,7 +176,7 @@ impl Kme {
         }
     }
 
-    /// What was asked and given since the start.
+    /// Returns the counters of requests and keys since the start.
     pub fn statistics(&self) -> Statistics {
         self.0.caller.statistics()
     }
@@ -188,7 +188,7 @@ impl Events {
         self.0.recv().await
     }
 
-    /// As [`recv`](Self::recv), for a task that polls.
+    /// Polls for the next answer, as [`recv`](Self::recv) awaits it.
     pub fn poll_recv(
         &mut self,
         cx: &mut std::task::Context<'_>,
@@ -214,7 +214,7 @@ async fn serve(
     loop {
         let permit = tokio::select! {
             permit = Arc::clone(&free).acquire_owned() => permit,
-            // Nobody listens any more: calls in flight are cut off by dropping them.
+            // The receiver is gone: dropping the calls in flight aborts them.
             () = events.closed() => return,
         };
         let (Ok(permit), Some(job)) = (permit, next(&mut jobs, &mut running, &events).await) else {
@@ -228,7 +228,7 @@ async fn serve(
             drop(permit);
             let took = job.since.elapsed();
             let answer = Answer { request: job.request, took, outcome };
-            // A failed send: nobody is left to listen.
+            // A failed send means that the receiver is gone.
             let _ = events.send(KmeAnswer { origin: job.origin, answer }).await;
         });
     }
@@ -254,7 +254,8 @@ async fn next(
 fn client(config: &QkdConfig) -> Result<Client, KmeError> {
     let of_client = config.kme_quirks.iter().filter(|quirk| *quirk != QkdConfig::NO_NAME_CHECK);
     let quirks = of_client.cloned().collect::<Vec<_>>().join(",").parse::<Quirks>();
-    // In a block of its own size, which nobody has to shrink; what was read is erased.
+    // The key is in a block of exactly its size, so that no shrinking leaves a copy; the buffer that was read is
+    // erased.
     let sae_key =
         Box::<[u8]>::from(read("AXON_SAE_KEY", &config.sae_key, FileRules::KEY)?.as_slice());
     let mut builder = Client::builder()
@@ -264,7 +265,7 @@ fn client(config: &QkdConfig) -> Result<Client, KmeError> {
         .sae_key(sae_key)
         .connect_timeout(config.kme_connect_timeout)
         .timeout(config.kme_answer_timeout)
-        // The machines repeat what may be repeated, and know when.
+        // The state machines repeat calls that may be repeated, at the right time.
         .retry(RetryPolicy::none())
         .quirks(quirks.map_err(|error| setting(config, error))?);
     if let Some(id) = &config.kme_id {

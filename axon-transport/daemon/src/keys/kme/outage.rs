@@ -15,7 +15,7 @@ const REFUSED: u64 = 20;
 /// Calls and SAEs that are watched.
 const MAX: usize = 512;
 
-/// What the log is to say.
+/// A line for the log.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Notice {
     Fails(String),
@@ -34,7 +34,7 @@ struct Outage {
     /// Failures in a row.
     calls: u64,
     since: Option<Instant>,
-    /// What was last said, and when.
+    /// The kind and the time of the last log line.
     kind: Option<FailureKind>,
     said: Option<Instant>,
 }
@@ -44,7 +44,7 @@ impl Outages {
         Self { kme: kme.to_owned(), sae: sae.to_owned(), watched: HashMap::new() }
     }
 
-    /// A call ended. What is to be said of it, if anything.
+    /// Records the end of a call. Returns the line to log, if any.
     pub(super) fn record(
         &mut self,
         now: Instant,
@@ -95,7 +95,7 @@ impl Outages {
         let outage = self.watched.get_mut(key)?;
         let (calls, since) = (std::mem::take(&mut outage.calls), outage.since.take());
         let Some(_) = outage.kind.take() else {
-            // Nothing of it was said, and nothing is to be kept quiet by it.
+            // The failure was never logged, so its end is not logged either.
             if outage.said.is_none() {
                 self.watched.remove(key);
             }
@@ -113,7 +113,7 @@ impl Outages {
     }
 }
 
-/// What to do about it.
+/// Returns advice on how to fix the failure.
 fn advice(kind: FailureKind) -> &'static str {
     match kind {
         FailureKind::Unreachable => {
@@ -172,7 +172,7 @@ mod tests {
         for i in 1..100 {
             assert_eq!(outages.record(start + s(i), &enc("sae-b"), Some(&gone)), None);
         }
-        // One direction says nothing of the other, nor one SAE of another.
+        // A success in one direction ends no outage of the other direction, nor of another SAE.
         assert_eq!(outages.record(start, &dec("sae-b", KeyPurpose::Messages), None), None);
         assert_eq!(outages.record(start, &enc("sae-c"), None), None);
         let slow = RequestFailure::new(FailureKind::Ambiguous, "no answer");

@@ -13,7 +13,7 @@ use crate::keys::request::{FailureKind, Fetched, KeyPurpose, KmeRequest, Request
 /// Peers whose stock is shown.
 const MAX_PEERS: usize = 256;
 
-/// What the KME was asked and what it gave since the start.
+/// Counters of the KME's calls and answers since the start.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 #[non_exhaustive]
 pub struct Statistics {
@@ -33,9 +33,9 @@ pub struct Statistics {
     pub keys_messages: u64,
     /// Keys of `enc_keys` calls that were cut off: the KME may have handed them out.
     pub keys_possibly_lost: u64,
-    /// Keys in stock by peer, as the KME last said.
+    /// Number of stored keys by peer, from the KME's last answer.
     pub stored_key_count: BTreeMap<String, u64>,
-    /// The last failure, whatever the call.
+    /// The last failure, of any call.
     pub last_failure: Option<String>,
 }
 
@@ -45,9 +45,9 @@ pub struct Statistics {
 pub struct CallStatistics {
     /// Made.
     pub calls: u64,
-    /// Of them failed.
+    /// Number of these calls that failed.
     pub failures: u64,
-    /// Recent mean time to the answer, over those that succeeded.
+    /// Recent mean time to the answer, over successful calls.
     pub latency_ms: Option<f64>,
 }
 
@@ -117,7 +117,7 @@ impl Recorder {
     }
 
     fn lock(&self) -> MutexGuard<'_, Statistics> {
-        // Counters stay sound whatever thread panicked over them.
+        // The counters stay consistent even if a thread panicked while it held the lock.
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -194,7 +194,7 @@ async fn a_stuck_kme_holds_no_more_than_its_bounds_and_links_go_first() {
     assert!(event.answer.outcome.is_ok());
 }
 
-/// By the order of the answers: the first call would wait for half a minute.
+/// The order of the answers shows it: the first call would wait for half a minute.
 #[tokio::test(flavor = "multi_thread")]
 async fn request_does_not_wait_for_one_that_the_kme_never_answers() {
     let network = network().await;
@@ -207,7 +207,7 @@ async fn request_does_not_wait_for_one_that_the_kme_never_answers() {
     for request in [enc(1), for_a_link] {
         sim.inject(Fault::Silence, 1);
         kme.submit(RequestOrigin::Sender(1), request.clone()).unwrap();
-        // The KME has the request, and says nothing to it.
+        // The KME has received the request and does not answer it.
         while !sim.plans().is_empty() {
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
@@ -245,7 +245,7 @@ async fn silent_kme_is_given_up_after_the_answer_limit_of_the_settings() {
     }
 }
 
-/// As above. The kernel takes the connection, and nobody speaks TLS.
+/// As in the test above. The kernel accepts the connection, and no process speaks TLS on it.
 #[tokio::test]
 async fn unreachable_kme_is_given_up_after_the_connect_timeout() {
     let network = network().await;

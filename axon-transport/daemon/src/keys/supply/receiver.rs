@@ -20,7 +20,7 @@ use crate::keys::{
 
 /// The time for which unused keys of a lost connection wait to be announced on the next one.
 const KEY_RETENTION: Duration = Duration::from_secs(120);
-/// Most of these waiting keys.
+/// Maximum number of these waiting keys.
 const MAX_RETAINED_KEYS: usize = 512;
 
 /// The keys of one peer's messages to this host.

@@ -14,14 +14,14 @@ use crate::{
     wire::keys::announceable,
 };
 
-/// How long the whole proof may take at most: four calls of the longest that may be set.
+/// Maximum time for the whole proof: four calls with the longest timeout that may be set.
 const DEADLINE: Duration = Duration::from_secs(60);
-/// Calls to `enc_keys`, where it is certain that those before cost no key.
+/// Maximum number of calls to `enc_keys`; a call is repeated only if the calls before certainly cost no key.
 const MAX_CALLS: u32 = 3;
-/// Wait before such a call is made again.
+/// Wait before `enc_keys` is called again.
 const RETRY_INTERVAL: Duration = Duration::from_millis(500);
 
-/// Has the client of one connection prove its name.
+/// Makes the client of one connection prove its name.
 pub struct ClientProof {
     client_sae: String,
     ready: Exporter,
@@ -39,12 +39,12 @@ enum ProofStep {
     Failed(ProofFailure),
 }
 
-/// How far a [`ClientProof`] is.
+/// The state of a [`ClientProof`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum ProofState {
-    /// Nothing is settled.
+    /// The proof is not yet settled.
     Pending,
-    /// The client is who it claims to be.
+    /// The client has proven its name.
     Proven,
     /// It is not known to be: close the connection.
     Failed(ProofFailure),
@@ -55,7 +55,7 @@ pub enum ProofState {
 #[non_exhaustive]
 pub enum ProofFailure {
     /// Our KME gave no key for it.
-    // The client is told this before its name is proven, so it holds nothing of what the KME said.
+    // This text goes to the client before its name is proven, so it does not contain what the KME answered.
     #[error("no key to prove SAE {sae:?} with: enc_keys: {}", failure.kind.told())]
     NoKey {
         /// The client.
@@ -63,7 +63,7 @@ pub enum ProofFailure {
         /// Why.
         failure: RequestFailure,
     },
-    /// Its KME gave it no key.
+    /// The client's KME gave it no key.
     #[error("SAE {sae:?} could not fetch the key announced to it: {reason}")]
     ClientHasNoKey {
         /// The client.
@@ -79,7 +79,7 @@ pub enum ProofFailure {
     Unexpected {
         /// The client.
         sae: String,
-        /// What it sent.
+        /// The kind of the message.
         message: &'static str,
     },
     /// Time ran out.
@@ -99,7 +99,7 @@ impl ProofFailure {
 }
 
 impl ClientProof {
-    /// Has the client of the connection with these `exporters` prove that it is `client_sae`.
+    /// Starts a proof that the client of the connection with these `exporters` is `client_sae`.
     pub fn new(now: Duration, client_sae: &str, exporters: &Exporters) -> Self {
         Self {
             client_sae: client_sae.to_owned(),
@@ -165,7 +165,7 @@ impl ClientProof {
         }
     }
 
-    /// What the client sent. Everything but the right READY ends in failure.
+    /// Handles a message of the client. Every message but the right READY ends in failure.
     pub fn handle_message(&mut self, _now: Duration, message: &KeyMessage) {
         let sae = || self.client_sae.clone();
         let failure = match (&self.step, message) {
@@ -210,7 +210,7 @@ impl ClientProof {
         }
     }
 
-    /// How far it is.
+    /// Returns the state of the proof.
     pub fn state(&self) -> ProofState {
         match &self.step {
             ProofStep::Proven(..) => ProofState::Proven,

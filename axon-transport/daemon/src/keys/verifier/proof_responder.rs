@@ -32,10 +32,10 @@ impl ProofResponder {
         }
     }
 
-    /// What the server sent.
+    /// Handles a message of the server.
     ///
     /// # Errors
-    /// Anything but one ANNOUNCE of one key.
+    /// The message is not one ANNOUNCE of one key.
     pub fn handle_message(
         &mut self,
         now: Duration,
@@ -84,7 +84,7 @@ impl ProofResponder {
         self.fetches.poll_timeout()
     }
 
-    /// Whether the server was answered: with READY, or with FAILED and why.
+    /// Returns the answer that the server got: READY, or FAILED with the reason. `None` before the answer.
     pub fn answered(&self) -> Option<Result<(), String>> {
         self.answered.clone()
     }

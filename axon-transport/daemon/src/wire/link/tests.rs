@@ -44,7 +44,7 @@ fn unknown_types_and_keys_are_skipped() {
 
 #[test]
 fn an_unknown_type_is_skipped_without_decompression() {
-    // Not a zstd frame, and of a length that no map may have.
+    // This frame is not a zstd frame, and its length exceeds every map's.
     for length in [16, u32::MAX] {
         let frame = [&[0xff][..], &length.to_be_bytes(), b"no zstd frame"].concat();
         assert_eq!(decode(&frame).unwrap(), None);

@@ -238,7 +238,7 @@ fn goodbyes_and_beacons(ms: u64) -> Vec<(SocketAddr, Arrival, Datagram)> {
     all
 }
 
-/// Forges all of these, and goodbyes under the same ids from the forged addresses.
+/// Forges the datagrams of all three floods, and goodbyes under the same ids from the forged addresses.
 fn everything(ms: u64) -> Vec<(SocketAddr, Arrival, Datagram)> {
     let mut all = from_everywhere(ms);
     all.extend(from_one_address(ms));

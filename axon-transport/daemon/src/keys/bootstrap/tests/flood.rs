@@ -23,7 +23,7 @@ fn steps() -> impl Strategy<Value = Vec<Step>> {
 }
 
 proptest! {
-    /// Calls to the KME stay within their limits, whatever invented identities arrive from whatever sources.
+    /// Calls to the KME stay within their limits for any invented identities from any sources.
     #[test]
     fn calls_stay_within_bounds(steps in steps(), star: bool) {
         let peers = if star { QkdPeers::Any } else { listed(&["sae-0", "sae-1"]) };
