@@ -1,4 +1,4 @@
-//! The counters of a link for status: what it carried, and what was dropped on the way.
+//! The counters of a link for status: samples that it carried, and samples that were dropped.
 
 use std::{
     cell::{Cell, RefCell},
@@ -11,13 +11,14 @@ use axon_transport::{internal::text::plain, status::CompressedStatus};
 
 use crate::bridge::OTHER_TOPICS;
 
-/// Topics of which losses are noted between two looks. Losses of further topics are noted together.
+/// Number of topics whose losses are counted separately between two reports. Losses of further topics are counted
+/// together.
 const TOPICS: usize = 2048;
 /// The longest name, in bytes, under which losses are noted.
 const NAME: usize = 1024;
-/// How much of a name is logged, in characters.
+/// Maximum number of characters of a logged name.
 const LOGGED: usize = 256;
-/// How many topics one line of the log names.
+/// Maximum number of topics that one line of the log names.
 const NAMED: usize = 20;
 
 /// Samples of one topic that were dropped for one cause.
@@ -39,12 +40,12 @@ pub(crate) struct Counters {
     bytes_out: Cell<u64>,
     compressed: Cell<CompressedStatus>,
     dropped: RefCell<BTreeMap<&'static str, u64>>,
-    /// What was dropped since it was looked at last.
+    /// Samples that were dropped since the last report, by topic and cause.
     lost: RefCell<BTreeMap<Arc<str>, BTreeMap<&'static str, u64>>>,
 }
 
 impl Counters {
-    /// A sample arrived and was published here.
+    /// Records that a sample arrived and was published here.
     pub(crate) fn arrived(&self, bytes: usize) {
         self.samples_in.set(self.samples_in.get() + 1);
         self.bytes_in.set(self.bytes_in.get() + bytes as u64);
@@ -56,13 +57,13 @@ impl Counters {
         self.copies_in.set(self.copies_in.get() + 1);
     }
 
-    /// A sample was handed to QUIC.
+    /// Records that a sample was handed to QUIC.
     pub(crate) fn sent(&self, bytes: usize) {
         self.samples_out.set(self.samples_out.get() + 1);
         self.bytes_out.set(self.bytes_out.get() + bytes as u64);
     }
 
-    /// A sample of so many bytes was compressed to so few.
+    /// Records that a sample of `length` bytes was compressed to `frame` bytes.
     pub(crate) fn compressed(&self, length: usize, frame: usize) {
         let mut compressed = self.compressed.get();
         compressed.samples += 1;
@@ -91,7 +92,7 @@ impl Counters {
         *samples = samples.saturating_add(count);
     }
 
-    /// What was lost since the last call, by topic and cause: each sample once.
+    /// Returns the samples lost since the last call, by topic and cause. Each sample counts once.
     pub(crate) fn take_lost(&self) -> Vec<TopicLoss> {
         let lost = self.lost.take();
         let each = lost.into_iter().flat_map(|(topic, causes)| {
@@ -116,8 +117,9 @@ impl Counters {
     }
 }
 
-/// Samples by topic, for one line of the log: the topics that have most of them by name, and how many others there are. A
-/// line for each would be left out where there are many: the log's rate limit is by line of code.
+/// Returns the samples by topic as text for one line of the log: the names of the topics with the most samples, and the
+/// number of the other topics. One line for each topic would not work, because the log's rate limit counts by line of
+/// code.
 pub(crate) fn by_topic<'a>(samples: impl IntoIterator<Item = (&'a str, u64)>) -> (String, u64) {
     let mut topics = BTreeMap::<_, u64>::new();
     for (topic, samples) in samples {
@@ -136,8 +138,8 @@ pub(crate) fn by_topic<'a>(samples: impl IntoIterator<Item = (&'a str, u64)>) ->
     (text, sum(&topics))
 }
 
-/// Logs what was lost on the way to or from a peer, in one line: the topic that lost most by name. What `max_hz` leaves
-/// out is what its author wants.
+/// Logs the losses on the way to or from a peer in one line, which names the topic with the most losses. Samples that
+/// `max_hz` leaves out are intended, so they are not logged.
 pub(crate) fn log(losses: &[TopicLoss], peer: &str) {
     let unwanted: Vec<_> = losses.iter().filter(|loss| loss.cause != "max_hz").cloned().collect();
     let losses = &unwanted;
@@ -150,11 +152,12 @@ pub(crate) fn log(losses: &[TopicLoss], peer: &str) {
     }
 }
 
-/// The topic that lost most, why, how many samples, and how many were lost of others.
+/// Returns the topic with the most losses, the causes, the number of its lost samples, and the number of samples lost
+/// of other topics.
 fn worst(losses: &[TopicLoss]) -> Option<(&str, String, u64, u64)> {
     let sum =
         |losses: &[TopicLoss]| losses.iter().fold(0_u64, |all, l| all.saturating_add(l.samples));
-    // Those of a topic are together.
+    // The losses of one topic are adjacent.
     let topics = losses.chunk_by(|one, other| one.topic == other.topic);
     let worst = topics.max_by_key(|losses| sum(losses))?;
     let causes = worst.iter().map(|loss| format!("{} {}", loss.cause, loss.samples));

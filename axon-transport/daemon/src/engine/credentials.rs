@@ -32,14 +32,14 @@ use crate::{
 /// Handshakes of unvalidated addresses that QUIC keeps.
 const MAX_INCOMING: usize = 256;
 
-/// The engine's time, in seconds, as QUIC dates the tokens that validate addresses. QUIC's own default is the wall clock:
-/// one that jumps would refuse a handshake that is under way. Another daemon does not see these tokens.
+/// The engine's time, in seconds, with which QUIC dates the tokens that validate addresses. QUIC's own default is the
+/// wall clock; if that jumped, QUIC would refuse a handshake under way. Another daemon does not see these tokens.
 #[derive(Debug, Default)]
 struct TokenTime(AtomicU64);
 
 impl TimeSource for TokenTime {
     fn now(&self) -> SystemTime {
-        // Relaxed: the engine's thread alone writes and reads it.
+        // Relaxed: only the engine's thread writes and reads it.
         SystemTime::UNIX_EPOCH + Duration::from_secs(self.0.load(Ordering::Relaxed))
     }
 }
@@ -54,41 +54,41 @@ pub(crate) struct Credentials {
 }
 
 impl Credentials {
-    /// The settings of `config`, with the identity that its files say.
+    /// Creates credentials with the settings of `config` and the identity that its files define.
     pub(crate) fn new(config: Arc<Config>, identity: Option<Arc<Identity>>) -> Self {
         Self { transports: Transports::new(&config), config, identity, time: Arc::default() }
     }
 
-    /// The engine's time goes on.
+    /// Advances the engine's time.
     pub(super) fn set_time(&self, now: Duration) {
         // Relaxed: see `TokenTime`.
         self.time.0.store(now.as_secs(), Ordering::Relaxed);
     }
 
-    /// The classic identity in force; `None` in qkd.
+    /// Returns the classic identity in force; `None` in qkd.
     pub(crate) fn auth(&self) -> Option<Auth> {
         self.identity.as_ref().map(|identity| identity.auth())
     }
 
-    /// Whether peers prove who they are.
+    /// Returns whether peers prove who they are.
     pub(crate) fn authenticates(&self) -> bool {
         !matches!(self.auth(), Some(Auth::None(_)))
     }
 
-    /// Why no new peer is accepted, if so: a file of the identity cannot be used.
+    /// Returns the reason why no new peer is accepted, if so: a file of the identity cannot be used.
     pub(crate) fn closed(&self) -> Option<String> {
         self.identity.as_ref().and_then(|identity| identity.closed())
     }
 
-    /// The transport settings of one connection with a peer at `address`, whose events are written.
+    /// Returns the transport settings of one connection with a peer at `address`, whose events go to the log `stream`.
     pub(crate) fn logged(&self, stream: QlogStream, address: IpAddr) -> Arc<TransportConfig> {
         Transports::logged(&self.config, stream, address)
     }
 
-    /// The client's side of a handshake with a server at `address`, in qkd on one PSK.
+    /// Returns the TLS settings of the client's side of a handshake with a server at `address`, in qkd on one PSK.
     ///
     /// # Errors
-    /// The settings, or the key, make no TLS client.
+    /// The settings or the key are not valid for a TLS client.
     pub(crate) fn client(
         &self,
         attempt: Option<&DialKey>,
@@ -107,10 +107,11 @@ impl Credentials {
         Ok(client)
     }
 
-    /// The server's side of a handshake with a client at `address`, in qkd with the resolver of PSKs.
+    /// Returns the TLS settings of the server's side of a handshake with a client at `address`, in qkd with the
+    /// resolver of PSKs.
     ///
     /// # Errors
-    /// The settings make no TLS server.
+    /// The settings are not valid for a TLS server.
     pub(crate) fn server(
         &self,
         resolver: Option<Arc<Resolver>>,
@@ -132,9 +133,9 @@ impl Credentials {
         Ok(server)
     }
 
-    /// Why a peer with a link, of which this host is the `side`, would not be accepted now: its pin was removed or
-    /// ended at `wall`, or its certificate ended or was revoked. `chain` is `None` where certificates need not be checked,
-    /// since that costs signatures.
+    /// Returns the reason why a peer with a link, of which this host is the `side`, would not be accepted now: its pin
+    /// was removed or ended at `wall`, or its certificate ended or was revoked. `chain` is `None` where certificates
+    /// need not be checked, since that costs signatures.
     pub(crate) fn distrust(
         &self,
         negotiated: &Negotiated,

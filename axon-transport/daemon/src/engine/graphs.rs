@@ -11,8 +11,8 @@ use crate::{
     link::{GraphResync, LinkMessage, Subscribe},
 };
 
-/// What following a change costs for each endpoint of both graphs, as an estimate: other peers have nine times as long
-/// before this one's next turn.
+/// Estimated cost of following a change, for each endpoint of both graphs: other peers get nine times as long before
+/// this peer's next turn.
 const ENDPOINT: Duration = Duration::from_nanos(500);
 
 impl Engine {
@@ -67,7 +67,7 @@ impl Engine {
         }
         let Some(peer) = self.peers.get_mut(daemon) else { return 0 };
         let PeerGraphChange { reset, mut added, removed } = peer.remote.changes();
-        // An endpoint is its host's: no other host speaks for one of ours, or for the engine.
+        // An endpoint belongs to its host: another host may not announce an endpoint of ours, or of the engine.
         let ours: Vec<Gid> = added
             .iter()
             .map(|e| e.endpoint.gid)
@@ -88,7 +88,7 @@ impl Engine {
         self.end_dead(dead, now);
         let Some(peer) = self.peers.get(daemon) else { return 0 };
         let endpoints = peer.remote.len();
-        // A peer that is silent is told of as a whole once it is back.
+        // The control plane gets the whole graph of a silent peer once the peer is back.
         if !peer.silent {
             self.effects.tell(ToControl::RemoteGraph { daemon, reset, added, removed });
         }
@@ -105,8 +105,9 @@ impl Engine {
         }
     }
 
-    /// A peer asks for a route. Ends the links of daemons of the same host that were asked for by the same
-    /// subscriptions: those links are dead, and the route begins with what they did not carry.
+    /// Handles a peer's request for a route. Ends the links of other daemons of the same host whose routes the same
+    /// subscriptions requested. Those links are dead, and the new route begins with the samples that they did not
+    /// carry.
     pub(super) fn take_over_route(&mut self, daemon: DaemonId, asks: &Subscribe, now: Duration) {
         let identity = |other| self.links.view(self.links.current(other)?)?.identity();
         let (Some(owner), Some(asking)) = (identity(daemon), self.peers.get(daemon)) else {
@@ -114,7 +115,8 @@ impl Engine {
         };
         let others = self.peers.iter().filter(|(other, _)| *other != daemon);
         let same_host = others.filter(|(other, _)| identity(*other).as_ref() == Some(&owner));
-        // A daemon ends links for its own subscriptions alone: it may name those of others, which it reads in the graph.
+        // A daemon ends links only for its own subscriptions: it may name subscriptions of other daemons, which it
+        // reads in the graph.
         let own = asks.subscribers.iter().map(|reader| reader.gid);
         let own: Vec<_> = own.filter(|gid| asking.remote.owns(gid)).collect();
         let dead = same_host.filter(|(_, peer)| peer.serves_one_of(asks, &own));
@@ -124,8 +126,8 @@ impl Engine {
         }
     }
 
-    /// The links of peers whose endpoints a restarted daemon of the same host announces: those links are dead. The
-    /// claim of another host is ignored, and taken out of what it added.
+    /// Returns the links of peers whose endpoints a restarted daemon of the same host announces: those links are dead.
+    /// The claim of another host is ignored and removed from `added`.
     fn taken_over(&mut self, daemon: DaemonId, added: &mut Vec<RemoteEndpoint>) -> Vec<u64> {
         let mut dead = Vec::new();
         let identity = |engine: &Self, daemon: DaemonId| {

@@ -70,7 +70,8 @@ use crate::{
     owner::SessionKeys,
 };
 
-/// Bytes of streams that one pass reads. The rest has the next pass, after timers and packets that came meanwhile.
+/// Maximum number of stream bytes that one pass reads. The next pass reads the rest, after timers and packets that came
+/// meanwhile.
 const READ: usize = 8 << 20;
 
 /// The parts of an engine that its owner makes.
@@ -136,7 +137,7 @@ impl Engine {
         self.links.handle_datagram(now, endpoint, from, local, ecn, bytes);
     }
 
-    /// Whether datagrams of discovery are held, since many came.
+    /// Returns whether discovery datagrams are held back, because many came.
     pub(crate) fn holds_discovery(&self) -> bool {
         self.links.holds_discovery()
     }
@@ -145,7 +146,7 @@ impl Engine {
     pub(crate) fn handle_order(&mut self, now: Duration, order: ToGateway) {
         match order {
             ToGateway::Dial { daemon, sae, addresses, listed, standing } => {
-                // Discovery did not hear yet that it is linked, or that its path works again.
+                // Discovery does not know yet that the peer has a link, or that its path works again.
                 if self.links.stands(daemon) {
                     return self.effects.tell(ToControl::DialFailed { daemon, standing });
                 }
@@ -235,7 +236,7 @@ impl Engine {
                 idle &= !self.read_streams(&mut left, now);
             }
             idle &= !self.say(now);
-            // All that came over a lost connection is read before its link ends.
+            // The engine reads everything that came over a lost connection before it ends the link.
             if idle && (left == 0 || !self.links.end_lost(now)) {
                 break;
             }
@@ -262,7 +263,7 @@ impl Engine {
                     peer.send_graph(with.local, true);
                 });
                 self.reports.hurry(now);
-                // Streams that the peer opened before this host knew it: QUIC told of them once.
+                // This handles streams that the peer opened before this host knew it: QUIC reports them only once.
                 let opened = StreamEvent::Opened { dir: Dir::Uni };
                 self.handle_stream(now, number, daemon, opened);
             }
@@ -333,7 +334,7 @@ impl Engine {
             self.links.touch(superseded);
             let old = self.links.connection(superseded).map(|connection| &mut connection.quic);
             self.peers.with(daemon, |peer, with| {
-                // Before anything is said of this host's graph.
+                // The permissions are set before any part of this host's graph is sent.
                 peer.set_permissions(permissions, with.config, now);
                 peer.succeed(number, binding, with.local);
                 peer.outbound.succeed(old);
@@ -464,7 +465,7 @@ impl Engine {
         }
     }
 
-    /// Collects what the links report.
+    /// Collects reports, KME requests, compression orders, and key_IDs to record as used.
     fn collect(&mut self, now: Duration) {
         while let Some(report) = self.links.poll_report() {
             self.effects.tell_report(report);
@@ -483,13 +484,13 @@ impl Engine {
     /// When [`handle_timeout`](Self::handle_timeout) is due.
     pub(crate) fn poll_timeout(&self, now: Duration) -> Option<Duration> {
         let report = (!self.peers.is_empty()).then(|| self.reports.poll_timeout());
-        // What the last packets of a pass brought about.
+        // This covers the results of the last packets of a pass.
         let work = self.links.has_work().then_some(now);
         let parts = [self.links.poll_timeout(), self.peers.poll_timeout(now), report, work];
         parts.into_iter().flatten().min()
     }
 
-    /// Does what is due. [`settle`](Self::settle) has to follow.
+    /// Handles all due timers. The caller must call [`settle`](Self::settle) afterwards.
     pub(crate) fn handle_timeout(&mut self, now: Duration) {
         self.links.handle_timeout(now);
         self.peers.handle_timeout(now);
@@ -540,7 +541,7 @@ impl Engine {
         Some(self.links.keyring.as_ref()?.status(now, kme, used))
     }
 
-    /// Ends all links and counts what they did not carry.
+    /// Ends all links and counts the samples that they did not carry.
     pub(crate) fn close(&mut self, now: Duration) {
         let texts = self.peers.iter().map(|(d, peer)| (d, self.links.peer_text(peer.link)));
         let texts: Vec<_> = texts.collect();
@@ -560,13 +561,13 @@ impl Engine {
         self.effects.tell_link_over(daemon, text, &unacknowledged, counted);
     }
 
-    /// Counts and logs what kept relays hold whose peers did not come back by this time.
+    /// Gives up kept relays whose peers did not come back by this time: counts and logs their samples.
     fn give_up_relays(&mut self, now: Duration) {
         let given_up = self.peers.give_up_relays(now);
         self.effects.tell_relays_given_up(given_up);
     }
 
-    /// Whether all connections are over.
+    /// Returns whether all connections are over.
     pub(crate) fn is_idle(&self) -> bool {
         self.links.is_idle()
     }

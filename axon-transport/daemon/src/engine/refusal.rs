@@ -1,4 +1,4 @@
-//! Why a connection did not become, or stay, a link: in words for log and status.
+//! The reason why a connection did not become, or stay, a link: a text for log and status.
 
 use std::fmt;
 
@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use crate::link::CloseCode;
 
-/// Which side refused.
+/// The side that refused.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 #[non_exhaustive]
@@ -24,11 +24,11 @@ pub enum RefusedBy {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
 pub struct Refusal {
-    /// Which side refused.
+    /// The side that refused.
     pub by: RefusedBy,
     /// The close code or TLS alert by its name, `unreachable` when there is none.
     pub name: String,
-    /// What differed or failed, and where that says so, what to do.
+    /// The difference or failure, in some cases with advice.
     pub reason: String,
     /// The TLS alert, if the handshake failed with one.
     pub alert: Option<u8>,
@@ -48,7 +48,7 @@ impl fmt::Display for Refusal {
 impl std::error::Error for Refusal {}
 
 impl Refusal {
-    /// This side refuses.
+    /// Makes a refusal by this side.
     pub(crate) fn here(code: CloseCode, reason: impl fmt::Display) -> Self {
         Self {
             by: RefusedBy::Here,
@@ -58,7 +58,7 @@ impl Refusal {
         }
     }
 
-    /// The peer could not be reached, or it was not even tried.
+    /// Makes a refusal for a peer that could not be reached, or was not even tried.
     pub(crate) fn network(reason: impl fmt::Display) -> Self {
         Self {
             by: RefusedBy::Network,
@@ -68,7 +68,7 @@ impl Refusal {
         }
     }
 
-    /// What `error` of a connection means.
+    /// Makes the refusal that `error` of a connection means.
     pub(crate) fn of(error: &ConnectionError) -> Self {
         let (by, name, reason) = match error {
             ConnectionError::ApplicationClosed(close) => {
@@ -100,7 +100,7 @@ impl Refusal {
     }
 }
 
-/// A peer's words, bounded and printable.
+/// Returns a peer's text, bounded and printable.
 fn text(bytes: &[u8]) -> String {
     axon_transport::internal::text::plain(&String::from_utf8_lossy(bytes), 300)
 }
@@ -132,7 +132,7 @@ fn transport_name(error: &ConnectionError) -> String {
     }
 }
 
-/// What an alert means between two AXON daemons.
+/// Returns the meaning of an alert between two AXON daemons.
 fn meaning(alert: u8) -> Option<&'static str> {
     Some(match alert {
         40 => {

@@ -30,7 +30,7 @@ impl Reports {
         self.next
     }
 
-    /// Whether a report is due. The next one is due a second later.
+    /// Returns whether a report is due. If so, the next one is due a second later.
     pub(super) fn take_due(&mut self, now: Duration) -> bool {
         let is_due = now >= self.next;
         if is_due {

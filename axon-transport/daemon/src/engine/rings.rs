@@ -50,7 +50,7 @@ pub(crate) trait RingReader {
     fn gid(&self) -> Gid;
     /// Returns the publishers that have samples to take.
     fn with_data(&self) -> Vec<Gid>;
-    /// Whether this publisher has samples to take.
+    /// Returns whether this publisher has samples to take.
     fn has_data_of(&self, publisher: &Gid) -> bool;
     /// Returns whether the relay reads this publisher.
     fn reads(&self, publisher: &Gid) -> bool;
@@ -212,7 +212,7 @@ impl RingSample {
         self.form == Form::Undecided
     }
 
-    /// Whether it is being compressed.
+    /// Returns whether the sample is being compressed.
     pub(crate) fn is_asked(&self) -> bool {
         matches!(self.form, Form::Asked(_))
     }
@@ -222,7 +222,7 @@ impl RingSample {
         self.form == Form::Asked(order)
     }
 
-    /// Whether it is compressed.
+    /// Returns whether the sample is compressed.
     pub(crate) fn is_compressed(&self) -> bool {
         matches!(self.form, Form::Zstd { .. })
     }

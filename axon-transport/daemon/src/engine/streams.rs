@@ -63,7 +63,8 @@ impl Engine {
         let mut violations = Vec::new();
         for peer in self.peers.values_mut() {
             peer.inbound.look_for_memory();
-            // As many as are ready now: one that goes on comes after the others, and after what they cause.
+            // Only the streams that are ready now are read. A stream that has more comes after the others, and after
+            // the work that they cause.
             for _ in 0..peer.inbound.ready() {
                 if *left == 0 {
                     break;

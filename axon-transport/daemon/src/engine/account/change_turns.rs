@@ -7,7 +7,7 @@ use crate::token_bucket::TokenBucket;
 
 /// Number of turns at once, and per second.
 const TURNS: (u32, u32) = (32, 10);
-/// Factor for the pause after a turn: other peers have so many times its duration.
+/// Factor for the pause after a turn: other peers get this many times its duration.
 const OTHERS: u32 = 9;
 
 /// The time of the next turn, in which the consequences of a peer's changes are computed. Changes in between are

@@ -115,7 +115,7 @@ impl Meter {
         }
     }
 
-    /// The most that was held.
+    /// Returns the maximum amount that was held.
     #[cfg(test)]
     pub(crate) fn peak(&self) -> usize {
         self.peak.get()

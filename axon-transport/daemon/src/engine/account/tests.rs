@@ -76,7 +76,7 @@ fn no_identity_exhausts_the_shared_pool() {
 #[test]
 fn replaced_charge_is_kept_if_the_new_one_exceeds_the_limit() {
     let pool = Meter::new(100);
-    // Of an account that is gone, and of the one that the identity has now.
+    // One charge of a closed account, and one of the account that the identity has now.
     let [old, new] = [80, 80].map(|most| Meter::within(&pool, most));
     let [kept, own] = [old.charge(30).unwrap(), new.charge(30).unwrap()];
     assert!(new.charge(10).is_none(), "half of what others leave");
@@ -85,7 +85,7 @@ fn replaced_charge_is_kept_if_the_new_one_exceeds_the_limit() {
     let kept = kept.exchange(&new, 20).expect("the 30 are given back");
     assert_eq!((kept.amount(), old.held(), new.held(), pool.held()), (20, 0, 50, 50));
     assert_eq!((old.released(), new.released()), (30, 0));
-    // Of one meter.
+    // Both charges are now of one meter.
     let kept = kept.exchange(&new, 21).expect_err("half of all");
     assert_eq!((kept.amount(), new.held()), (20, 50));
     let kept = kept.exchange(&new, 5).unwrap();
@@ -119,7 +119,8 @@ fn message_cost_counts_entries_and_frame_cost_counts_unpacked_bytes() {
 
     let frame = |kind: u8, unpacked: u32| [&[kind][..], &unpacked.to_be_bytes()].concat();
     assert_eq!(cost_of_frame(&frame(0x83, 4 << 20)), 1025);
-    // Nobody unpacks more than that, and nobody what is of unknown type.
+    // A longer frame costs no more, because it is never decompressed. A frame of unknown type is not decompressed
+    // either.
     assert_eq!(cost_of_frame(&frame(0x83, u32::MAX)), 1025);
     assert_eq!(cost_of_frame(&frame(0xff, 4 << 20)), 1);
     assert_eq!(cost_of_frame(&vec![0x7f; 1 << 20]), 257);

@@ -1,7 +1,7 @@
 //! Compresses samples that wait for a slow link, on a thread of the owner, for all peers.
 //!
-//! Compression pays while it takes much less time than what it saves: that is judged for each sample by the rate of the
-//! link and by what the compressor did so far. A sample that goes to several peers is compressed once.
+//! Compression pays while it takes much less time than it saves. Each sample is judged by the rate of the link and the
+//! measured speed of the compressor. A sample that goes to several peers is compressed once.
 
 #[cfg(test)]
 mod tests;
@@ -21,44 +21,44 @@ use super::rank::FlowId;
 
 /// The level of zstd.
 const LEVEL: i32 = 1;
-/// Shorter samples are sent as they are.
+/// Minimum length of a compressed sample; shorter samples are sent as they are.
 pub(crate) const SHORTEST: usize = 1 << 10;
-/// So are longer ones: the receiver decompresses a sample at once, and delivers no other meanwhile.
+/// Maximum length of a compressed sample. The receiver decompresses a sample at once, and delivers no other meanwhile.
 pub(crate) const LONGEST: usize = 8 << 20;
 /// Compression may take this share of the time for which the link is busy with the sample.
 const SHARE: f64 = 0.3;
-/// What a sample takes to the compressor's thread and back.
+/// Time to pass a sample to the compressor's thread and back.
 const THERE_AND_BACK: Duration = Duration::from_micros(100);
 /// The share of a sample that compression has to save, as a divisor.
 const MIN_SAVING_DIVISOR: usize = 10;
-/// Bytes that are with the compressor at once, unless it is one sample.
+/// Maximum number of bytes that are with the compressor at once, unless they are one sample.
 const MAX_COMPRESSOR_BYTES: usize = 4 << 20;
-/// Compressed samples that are kept for the other peers that will ask for them, in bytes.
+/// Maximum number of bytes of compressed samples that are kept for other peers that will ask for them.
 const MAX_SHARED_BYTES: usize = 4 << 20;
-/// The compressor's speed is that of about so many last bytes.
+/// The compressor's speed is averaged over about this many recent bytes.
 const MEASURED: f64 = (8 << 20) as f64;
-/// Its speed before the first sample, in bytes a second.
+/// The assumed speed before the first sample, in bytes a second.
 const SPEED: f64 = 200e6;
-/// It is tried at that speed again where nothing was compressed for so long: it may have been held up.
+/// After this time without compression the initial speed is assumed again: the compressor may have been held up.
 const TRIED_AGAIN: Duration = Duration::from_secs(5);
 
-/// What the owner is to compress.
+/// An order to the owner to compress a sample.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct CompressionOrder {
-    /// The number by which the answer names it.
+    /// The number by which the answer refers to the order.
     pub(crate) number: u64,
     /// The sample.
     pub(crate) payload: Bytes,
 }
 
-/// What became of an order.
+/// The result of an order.
 #[derive(Clone, Debug)]
 pub(crate) struct CompressionAnswer {
     /// The number of the order.
     pub(crate) number: u64,
-    /// One zstd frame, or nothing where that would save too little.
+    /// One zstd frame, or `None` if it would save too little.
     pub(crate) compressed: Option<Bytes>,
-    /// How long the compression took.
+    /// The duration of the compression.
     pub(crate) took: Duration,
 }
 
@@ -66,9 +66,9 @@ pub(crate) struct CompressionAnswer {
 pub(crate) struct Compressor(Option<zstd::bulk::Compressor<'static>>);
 
 impl Compressor {
-    /// One that has compressed nothing.
+    /// Creates a compressor that has compressed nothing.
     pub(crate) fn new() -> Self {
-        // Without memory for it, samples are sent as they are.
+        // If its memory cannot be allocated, samples are sent as they are.
         Self(zstd::bulk::Compressor::new(LEVEL).ok())
     }
 
@@ -82,7 +82,7 @@ impl Compressor {
         let most = order.payload.len() - order.payload.len().div_ceil(MIN_SAVING_DIVISOR);
         let compressed = self.0.as_mut().and_then(|zstd| {
             let mut frame = Vec::with_capacity(most);
-            // An error: the frame would be longer.
+            // An error means that the frame would be longer.
             zstd.compress_to_buffer(&order.payload, &mut frame).ok()?;
             frame.shrink_to_fit();
             Some(frame.into())
@@ -101,24 +101,25 @@ pub(crate) struct RequestingFlow {
     pub(crate) flow: FlowId,
 }
 
-/// A sample of a topic. Peers have relays of their own, which may read what a faulty publisher wrote under one number at
-/// different times: a frame is taken for a sample of the same length alone, or the peer would take it for malformed.
+/// The name of a sample of a topic. Peers have relays of their own. These may read different content under one number,
+/// if a faulty publisher changes it. So a frame stands only for a sample of the same length; otherwise the peer would
+/// take it for malformed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub(crate) struct SampleName {
     /// The topic and its type.
     pub(crate) topic: TopicHash,
     pub(crate) publisher: Gid,
     pub(crate) sequence: u64,
-    /// Its bytes.
+    /// The length in bytes.
     pub(crate) length: usize,
 }
 
 /// The answer to a flow that asks for a sample.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum CompressionReply {
-    /// It is compressed already, or not worth it.
+    /// The sample is compressed already, or not worth it.
     Known(Option<Bytes>),
-    /// The answer to the order with this number will tell.
+    /// The order with this number is in progress; its answer is the reply.
     Later(u64),
 }
 
@@ -142,12 +143,12 @@ struct OrderState {
     kept: HashMap<SampleName, Option<Bytes>>,
     kept_order: VecDeque<SampleName>,
     kept_bytes: usize,
-    /// Of the last orders: bytes, and seconds that they took. The time of the last answer.
+    /// Bytes of the recent orders, and the seconds that they took.
     measured: (f64, f64),
     used: Duration,
 }
 
-/// What is compressed for one of the peers.
+/// The compression for one peer.
 #[derive(Debug)]
 pub(crate) struct PeerCompression {
     all: Rc<Compression>,
@@ -155,17 +156,17 @@ pub(crate) struct PeerCompression {
 }
 
 impl PeerCompression {
-    /// The part of this peer.
+    /// Creates the compression for this peer.
     pub(crate) fn new(all: Rc<Compression>, daemon: DaemonId) -> Self {
         Self { all, daemon }
     }
 
-    /// As [`Compression::pays`].
+    /// Returns the result of [`Compression::pays`].
     pub(crate) fn pays(&self, length: usize, rate: f64, now: Duration) -> bool {
         self.all.pays(length, rate, now)
     }
 
-    /// As [`Compression::ask`].
+    /// Asks for a sample as [`Compression::ask`] does.
     pub(crate) fn ask(
         &self,
         flow: FlowId,
@@ -176,12 +177,12 @@ impl PeerCompression {
     }
 }
 
-/// What is compressed for the peers of one daemon.
+/// The compression for all peers of one daemon.
 #[derive(Debug)]
 pub(crate) struct Compression(RefCell<OrderState>);
 
 impl Compression {
-    /// Nothing was compressed yet.
+    /// Creates compression without an order.
     pub(crate) fn new() -> Self {
         Self(RefCell::new(OrderState {
             number: 0,
@@ -197,20 +198,21 @@ impl Compression {
         }))
     }
 
-    /// Whether a sample of this length is to be compressed for a link that carries so many bytes a second.
+    /// Returns whether a sample of this length should be compressed for a link with a rate of `rate` bytes a second.
     pub(crate) fn pays(&self, length: usize, rate: f64, now: Duration) -> bool {
         let state = self.0.borrow();
         let (bytes, seconds) = match now.saturating_sub(state.used) > TRIED_AGAIN {
             true => (SPEED, 1.0),
             false => state.measured,
         };
-        // Those that wait go first.
+        // The samples that wait are compressed first.
         let all = (state.pending_bytes + length) as f64;
         let takes = all * seconds / bytes + THERE_AND_BACK.as_secs_f64();
         (SHORTEST..=LONGEST).contains(&length) && takes < SHARE * length as f64 / rate
     }
 
-    /// A flow asks for a sample, which has a name if it is a topic's. `None`: too much is being compressed.
+    /// Handles the request of a flow for a sample, which has a name if it belongs to a topic. Returns `None` if too
+    /// much is being compressed.
     pub(crate) fn ask(
         &self,
         by: RequestingFlow,
@@ -242,12 +244,12 @@ impl Compression {
         Some(CompressionReply::Later(number))
     }
 
-    /// The next order for the owner.
+    /// Returns the next order for the owner.
     pub(crate) fn poll_order(&self) -> Option<CompressionOrder> {
         self.0.borrow_mut().orders.pop_front()
     }
 
-    /// The owner answers an order. Returns the flows that asked.
+    /// Handles the owner's answer to an order. Returns the flows that asked.
     pub(crate) fn handle_answer(
         &self,
         now: Duration,
@@ -288,7 +290,7 @@ impl OrderState {
     }
 }
 
-/// What a sample that is kept counts for: its name takes memory, too.
+/// Returns the bytes that a kept sample counts for, including an allowance for its name.
 fn kept_size(compressed: &Option<Bytes>) -> usize {
     compressed.as_ref().map_or(0, Bytes::len) + SHORTEST
 }

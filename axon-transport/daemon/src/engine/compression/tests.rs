@@ -6,7 +6,7 @@ fn asker(flow: FlowId) -> RequestingFlow {
     RequestingFlow { daemon: DaemonId([1; 16]), flow }
 }
 
-/// A name of a sample of ten thousand bytes.
+/// Returns the name of a sample of ten thousand bytes.
 fn name(sequence: u64) -> Option<SampleName> {
     let topic = TopicHash([3; 16]);
     Some(SampleName { topic, publisher: Gid([2; 16]), sequence, length: 10_000 })
@@ -18,7 +18,7 @@ fn text(length: usize) -> Bytes {
     b"a line of a log\n".iter().copied().cycle().take(length).collect::<Vec<_>>().into()
 }
 
-/// Bytes that no compressor makes shorter.
+/// Returns bytes that no compressor makes shorter.
 fn noise(length: usize) -> Bytes {
     let mut bytes = vec![0; length];
     StdRng::seed_from_u64(1).fill_bytes(&mut bytes);
@@ -90,7 +90,7 @@ fn the_speed_of_the_compressor_counts() {
     assert!(compression.pays(1 << 20, 250e6, NOW));
     run(1e7);
     assert!(!compression.pays(1 << 20, 54e6 / 8.0, NOW));
-    // It may have been held up.
+    // The compressor may have been held up.
     let later = NOW + TRIED_AGAIN;
     assert!(!compression.pays(1 << 20, 54e6 / 8.0, later));
     assert!(compression.pays(1 << 20, 54e6 / 8.0, later + Duration::from_nanos(1)));
@@ -119,7 +119,7 @@ fn a_sample_of_a_topic_is_compressed_once_for_all_peers() {
         compression.ask(asker(3), name(1), &payload),
         Some(CompressionReply::Known(compressed))
     );
-    // Those of services have no name that is theirs alone.
+    // Samples of services have no name, because no other flow may ask for them.
     assert_eq!(compression.ask(asker(1), None, &payload), later(3));
     assert_eq!(compression.ask(asker(2), None, &payload), later(4));
 }

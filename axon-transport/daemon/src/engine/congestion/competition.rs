@@ -30,7 +30,7 @@ pub(super) struct PersistentQueue {
     /// the first one the rate may still be from before the queue.
     window: u64,
     rate: f64,
-    /// How often the window shrank since.
+    /// The number of times that the window shrank since.
     times: u32,
 }
 

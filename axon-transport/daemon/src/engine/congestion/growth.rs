@@ -1,21 +1,20 @@
-//! Whether a larger window brings more bytes through, where packets are lost.
+//! Decides whether a larger window brings more bytes through, where packets are lost.
 //!
-//! A radio loses packets however small the window is. A short queue loses those that are too many, before any delay
-//! can be seen. The two are told apart by trials: growth must bring more bytes through, and a smaller window must lose
-//! less.
+//! A radio loses packets at any size of the window. A short queue drops packets that exceed it, before any delay can be
+//! seen. Trials distinguish the two: growth must bring more bytes through, and a smaller window must lose less.
 
 use std::time::Duration;
 
-/// How much the window grows in a trial.
+/// Factor by which the window grows in a trial.
 pub(super) const TRIAL: f64 = 1.25;
-/// Packets that must arrive in a trial in which the window grew so much, and in one in which it did not.
+/// Number of packets that must arrive in a trial with this growth, and in one without.
 const PACKETS: (u64, u64) = (40, 200);
-/// The share of packets lost beyond those by chance that asks for proof that growth pays, and the share that needs
-/// no proof.
+/// Excess of the loss over random loss above which growth must prove that it pays, and the excess from which the window
+/// shrinks in any case.
 const EXCESS: (f64, f64) = (0.02, 0.1);
 /// The part of its growth that the window must bring in bytes.
 const PAYS: f64 = 0.3;
-/// What a round adds to the averages of losses, and the most by which losses in bursts differ more than single ones.
+/// Weight of a new round in the averages of losses, and the maximum dispersion of losses.
 const AVERAGED: f64 = 1.0 / 16.0;
 const MOST_DISPERSED: f64 = 8.0;
 /// Rounds to wait before growth is tried again where it did not pay, at first and at most.
@@ -29,7 +28,7 @@ struct Trial {
     acknowledged: u64,
     lost: u64,
     time: Duration,
-    /// Bytes a second of the trial before.
+    /// Bytes a second of the trial before this one.
     before: Option<f64>,
 }
 
@@ -39,20 +38,20 @@ impl Trial {
     }
 }
 
-/// Judges growth.
+/// The judge of growth.
 #[derive(Debug, Clone)]
 pub(super) struct Growth {
     trial: Trial,
-    /// The share of packets that is lost however small the window is.
+    /// The share of packets that is lost at any size of the window.
     random_loss: f64,
-    /// The share that is lost, on average.
+    /// The average share of lost packets.
     mean_loss: f64,
-    /// How much the losses of rounds differ: their variance, by that of packets that are lost each by itself. A radio
-    /// loses packets in bursts, and then a trial says as much as one of so many times fewer packets.
+    /// The dispersion of the rounds' losses: their variance divided by the variance of independent losses. A radio
+    /// loses packets in bursts; a trial then has the evidence of one with this factor fewer packets.
     dispersion: f64,
-    /// The share that was lost before the window was cut for it.
+    /// The share of lost packets before the window was cut because of it.
     cut: Option<f64>,
-    /// Rounds to wait before growth is tried again, and those that are left.
+    /// Rounds to wait before growth is tried again, and the remaining ones.
     patience: u32,
     waiting: u32,
 }
@@ -71,13 +70,13 @@ impl Growth {
         }
     }
 
-    /// The share of packets that is lost by chance.
+    /// Returns the share of packets that is lost by chance.
     #[cfg(test)]
     pub(super) fn random_loss(&self) -> f64 {
         self.random_loss
     }
 
-    /// Whether the window grows step by step only, since growth did not pay.
+    /// Returns whether the window grows only step by step, because growth did not pay.
     pub(super) fn is_careful(&self) -> bool {
         self.patience > 0
     }
@@ -87,7 +86,7 @@ impl Growth {
         self.random_loss += (lost - self.random_loss) / 2.0;
     }
 
-    /// Whether so many losses are more than by chance.
+    /// Returns whether this loss exceeds random loss.
     pub(super) fn is_excessive(&self, lost: f64) -> bool {
         lost > self.random_loss + EXCESS.0
     }
@@ -114,7 +113,7 @@ impl Growth {
         self.trial = Trial::new(window, None);
     }
 
-    /// Whether the window stays for this round.
+    /// Returns whether the window stays for this round.
     pub(super) fn waits(&mut self, window: u64) -> bool {
         if self.waiting == 0 {
             return false;
@@ -124,7 +123,7 @@ impl Growth {
         true
     }
 
-    /// The window that brings this rate through, where only chance loses packets.
+    /// Returns the window that brings this rate through, if packets are lost only by chance.
     pub(super) fn held(&self, rate: f64, rtt: Duration) -> u64 {
         (0.95 * rate * rtt.as_secs_f64() / (1.0 - self.random_loss).max(0.1)) as u64
     }
@@ -150,7 +149,7 @@ impl Growth {
         if let Some(before) = self.cut.take()
             && lost > before * 0.7
         {
-            // A smaller window lost as much.
+            // The smaller window lost as much.
             self.random_loss = self.random_loss.max(lost.min(before));
         }
         if lost < self.random_loss {
@@ -158,7 +157,7 @@ impl Growth {
         } else if has_grown && pays == Some(true) {
             self.random_loss += (lost - self.random_loss) / 4.0;
         }
-        // Two standard deviations of what chance loses of so many packets.
+        // Two standard deviations of the random loss of this many packets.
         let share = self.random_loss;
         let by_chance = 2.0 * (share * (1.0 - share) * dispersion * mtu as f64 / bytes).sqrt();
         let excess = lost - share - by_chance;

@@ -1,7 +1,7 @@
 //! Counts the ECN marks that the peer of a connection reports.
 //!
-//! QUIC passes them to its congestion controller alone, and its statistics do not tell them from losses. So the
-//! controller is wrapped.
+//! QUIC passes them only to its congestion controller, and its statistics do not distinguish them from losses. So this
+//! module wraps the controller.
 
 use std::{any::Any, sync::Arc, time::Instant};
 
@@ -10,7 +10,7 @@ use quinn_proto::{
     congestion::{Controller, ControllerFactory, ControllerMetrics},
 };
 
-/// A congestion controller that counts reports of marks, and otherwise does as the one that it wraps.
+/// A congestion controller that counts reports of marks, and passes every call on to the controller that it wraps.
 struct EcnCountingController {
     inner: Box<dyn Controller>,
     marks: u64,
@@ -28,14 +28,14 @@ impl<F: ControllerFactory> ControllerFactory for EcnCountingFactory<F> {
     }
 }
 
-/// How often the peer of a connection reported new marks. A connection starts again at a new address of its peer.
+/// Returns how often the peer of a connection reported new marks. The count starts again at a new address of the peer.
 pub(in crate::engine) fn marks_reported(quic: &quinn_proto::Connection) -> u64 {
-    // A copy is the only way to it. It is made for status, once a second.
+    // Only a copy of the controller is accessible. It is made for status, once a second.
     let controller = quic.congestion_state().clone_box().into_any();
     controller.downcast_ref::<EcnCountingController>().map_or(0, |counting| counting.marks)
 }
 
-/// A copy of the controller that is wrapped.
+/// Returns a copy of the wrapped controller.
 pub(in crate::engine) fn wrapped(quic: &quinn_proto::Connection) -> Option<Box<dyn Any>> {
     let counting =
         quic.congestion_state().clone_box().into_any().downcast::<EcnCountingController>().ok()?;
@@ -75,7 +75,7 @@ impl Controller for EcnCountingController {
         is_persistent_congestion: bool,
         lost_bytes: u64,
     ) {
-        // Nothing is lost only where packets were marked.
+        // A congestion event without a loss is a report of marks.
         self.marks += u64::from(lost_bytes == 0);
         self.inner.on_congestion_event(now, sent, is_persistent_congestion, lost_bytes);
     }

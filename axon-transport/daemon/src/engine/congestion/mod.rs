@@ -11,8 +11,8 @@
 //! * Where packets are lost, growth must bring more bytes through: a queue too short to be seen drops instead
 //!   ([`growth`]).
 //! * While nothing is acknowledged, probes may exceed the window ([`silence`]).
-//! * Where the window shrinks and the queue does not, somebody else fills it, or the path has become longer. Until that
-//!   is known CUBIC decides, which has its share beside other CUBICs ([`competition`]).
+//! * Where the window shrinks and the queue does not, other traffic fills the queue, or the path has become longer.
+//!   Until that is known CUBIC decides, which gets its share beside other CUBIC flows ([`competition`]).
 
 mod competition;
 mod growth;
@@ -78,7 +78,7 @@ impl ControllerFactory for DelayConfig {
 
 /// Lets the next packet leave although the window is full. It shows which earlier packets are lost.
 pub(crate) fn let_probe_through(quic: &quinn_proto::Connection) {
-    // CUBIC and BBR have no such probe.
+    // Other controllers, CUBIC and BBR, have no such probe.
     if let Some(delay) = wrapped(quic).and_then(|controller| controller.downcast::<Delay>().ok()) {
         delay.silence.let_probe_through();
     }
@@ -192,7 +192,7 @@ impl Delay {
         }
     }
 
-    /// The queue that this link wants.
+    /// Returns the queue that this link wants.
     fn wanted(&self) -> Duration {
         let packets = PACKETS_WANTED * self.mtu as f64 / self.rate.max(1e3);
         self.wanted_at_any_rate().max(Duration::from_secs_f64(packets))

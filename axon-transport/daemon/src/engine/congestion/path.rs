@@ -2,30 +2,31 @@
 
 use std::time::{Duration, Instant};
 
-/// A shortest round trip is believed for one to two of these. It is measured anew each time that a queue drains.
+/// A shortest round trip stays valid for one to two times this period. It is measured anew each time that a queue
+/// drains.
 const AGE: Duration = Duration::from_secs(15);
 
 /// The shortest round trip of the last fifteen to thirty seconds.
 #[derive(Debug, Clone)]
 pub(super) struct Path {
     since: Instant,
-    /// The shortest since then, and of the time before.
+    /// The shortest round trip since then, and that of the period before.
     recent: Duration,
     before: Duration,
 }
 
 impl Path {
-    /// A path of which nothing is known.
+    /// Creates a path without a measurement.
     pub(super) fn new(now: Instant) -> Self {
         Self { since: now, recent: Duration::MAX, before: Duration::MAX }
     }
 
-    /// A path that is known to be so long.
+    /// Creates a path with a known round trip.
     pub(super) fn of(now: Instant, rtt: Duration) -> Self {
         Self { since: now, recent: rtt, before: Duration::MAX }
     }
 
-    /// The shortest round trip; the longest possible where none was seen.
+    /// Returns the shortest round trip; the largest possible value if none was measured.
     pub(super) fn get(&self) -> Duration {
         self.recent.min(self.before)
     }

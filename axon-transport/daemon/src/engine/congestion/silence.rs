@@ -1,8 +1,8 @@
-//! What may be sent beyond the window while nothing is acknowledged.
+//! The bytes that may be sent beyond the window while nothing is acknowledged.
 //!
-//! A radio that loses packets in bursts may lose all of a window, and then QUIC's probes with them. QUIC sends two
-//! probes after a time that doubles each time, and nothing else while the window is full. Some packets more with each
-//! probe outlast the burst, and so do the engine's own probes in between.
+//! A radio that loses packets in bursts may lose a whole window, and QUIC's probes with it. QUIC sends two probes after
+//! a time that doubles each time, and nothing else while the window is full. A few more packets with each probe outlast
+//! the burst, and so do the engine's own probes in between.
 
 use std::{
     sync::{
@@ -12,35 +12,36 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// Packets that each probe of QUIC lets through, at most, and beyond the window in all. A window has fewer.
+/// Maximum number of packets that each probe of QUIC lets through, and maximum number beyond the window in all. Neither
+/// exceeds the window.
 const PACKETS: (u64, u64) = (16, 64);
-/// Packets that a probe of the engine lets through, at most, and the share of a window that they are. They come much
-/// more often.
+/// Maximum number of packets that a probe of the engine lets through, and the divisor of the window for this number.
+/// The engine's probes are much more frequent.
 const OWN: (u64, u64) = (4, 8);
-/// The share of packets lost from which on a silence may be a burst of losses.
+/// Minimum share of lost packets at which a silence may be a burst of losses.
 const LOSES: f64 = 0.01;
-/// What a round adds to the average of losses.
+/// Weight of a new round in the average of losses.
 const AVERAGED: f64 = 1.0 / 16.0;
-/// An acknowledgement may be so much later than the first ones of the last round.
+/// Maximum delay of an acknowledgement after the earliest one of the last round.
 const LATE: Duration = Duration::from_millis(3);
 
 /// The time since the peer acknowledged something.
 #[derive(Debug, Clone)]
 pub(super) struct UnansweredTime {
-    /// When the peer was last heard, or sent something after it had acknowledged all.
+    /// When the last acknowledgement came, or when this side sent after the peer had acknowledged everything.
     since: Instant,
     /// The shortest round trip of the last round.
     round_trip: Duration,
-    /// Bytes on the way.
+    /// Bytes in flight.
     in_flight: u64,
     /// When the last probe was sent.
     probed_at: Option<Instant>,
-    /// Bytes that were on the way then.
+    /// Bytes that were in flight then.
     before: u64,
-    /// Whether the engine had it sent.
+    /// Whether the engine sent the last probe.
     is_own: bool,
-    /// Whether one packet may leave although the window is full. All copies of a controller share it, since QUIC shows
-    /// copies alone. One thread uses all of them, so that no order is needed.
+    /// Whether one packet may leave although the window is full. All copies of a controller share it, since QUIC gives
+    /// access only to copies. Relaxed suffices, because one thread uses all copies.
     probe: Arc<AtomicBool>,
     /// The share of packets that is lost.
     loss: f64,
@@ -60,17 +61,17 @@ impl UnansweredTime {
         }
     }
 
-    /// One packet may leave although the window is full.
+    /// Lets one packet leave although the window is full.
     pub(super) fn let_probe_through(&self) {
         self.probe.store(true, Ordering::Relaxed);
     }
 
-    /// The shortest round trip of a round.
+    /// Sets the shortest round trip of a round.
     pub(super) fn set_round_trip(&mut self, round_trip: Duration) {
         self.round_trip = round_trip;
     }
 
-    /// Bytes are sent. If nothing was acknowledged for longer than a round trip, they are a probe.
+    /// Handles sent bytes. If nothing was acknowledged for longer than a round trip, they are a probe.
     pub(super) fn handle_sent(&mut self, now: Instant, bytes: u64) {
         if self.in_flight == 0 {
             self.since = now;
@@ -84,12 +85,12 @@ impl UnansweredTime {
         self.in_flight += bytes;
     }
 
-    /// Bytes are lost, and no longer on the way.
+    /// Handles lost bytes, which are no longer in flight.
     pub(super) fn handle_lost(&mut self, bytes: u64) {
         self.in_flight = self.in_flight.saturating_sub(bytes);
     }
 
-    /// Packets were acknowledged, and so many bytes are on the way.
+    /// Handles acknowledgements, after which `in_flight` bytes are in flight.
     pub(super) fn handle_acks(&mut self, now: Instant, in_flight: u64) {
         (self.since, self.in_flight) = (now, in_flight);
         self.probed_at = None;
@@ -101,7 +102,7 @@ impl UnansweredTime {
         self.loss += (share - self.loss) * AVERAGED;
     }
 
-    /// The bytes that may be on the way, where they would be `window`.
+    /// Returns the maximum number of bytes in flight, which would be `window` without a silence.
     pub(super) fn widen(&self, window: u64, mtu: u64) -> u64 {
         if self.loss < LOSES {
             return window;
@@ -111,7 +112,7 @@ impl UnansweredTime {
             (true, _) => self.before + (window / OWN.1).clamp(mtu, OWN.0 * mtu),
             (false, _) => self.before + window.min(PACKETS.0 * mtu),
         };
-        // QUIC sends while less than the window is on the way.
+        // QUIC sends while less than the window is in flight.
         let probe = if self.probe.load(Ordering::Relaxed) { self.in_flight + mtu + 1 } else { 0 };
         more.max(probe).min(window + window.min(PACKETS.1 * mtu)).max(window)
     }
@@ -125,7 +126,7 @@ mod tests {
     const MTU: u64 = 1_000;
     const WINDOW: u64 = 20 * MTU;
 
-    /// A window that is sent at once.
+    /// Returns the state after a whole window was sent at once.
     fn full(start: Instant, lost: u64) -> UnansweredTime {
         let mut silence = UnansweredTime::new(start);
         for _ in 0..4 {
@@ -146,7 +147,7 @@ mod tests {
         let mut silence = full(start, 100);
         assert_eq!(silence.widen(WINDOW, MTU), WINDOW);
         for (ms, packets) in [(7, 36), (15, 40), (30, 40)] {
-            // Two probes, and what the window has left.
+            // These are two probes and the rest of the window.
             silence.handle_sent(at(start, ms), 2 * MTU);
             assert_eq!(silence.widen(WINDOW, MTU), packets * MTU, "after {ms} ms");
             silence.handle_sent(at(start, ms), 14 * MTU);
@@ -160,10 +161,10 @@ mod tests {
     fn a_probe_of_the_engine_lets_few_packets_through() {
         let start = Instant::now();
         let mut silence = full(start, 100);
-        // QUIC shows copies of a controller.
+        // QUIC gives access only to copies of a controller.
         silence.clone().let_probe_through();
         assert_eq!(silence.widen(WINDOW, MTU), WINDOW + MTU + 1);
-        // While nothing is acknowledged, it lets as many through as the window has eighths, four at most.
+        // While nothing is acknowledged, each probe lets an eighth of the window through, but at most four packets.
         for (number, ms) in (1..).zip([8, 11, 14]) {
             silence.handle_sent(at(start, ms), MTU);
             let more = silence.widen(WINDOW, MTU) - WINDOW;

@@ -89,7 +89,7 @@ impl fmt::Debug for Keyring {
 }
 
 impl Keyring {
-    /// The keyring of a daemon in `qkd`, `None` in `classic`.
+    /// Returns the keyring of a daemon in `qkd`, `None` in `classic`.
     pub(crate) fn new(config: &Config) -> Option<Self> {
         let Security::Qkd(qkd) = &config.security else { return None };
         let (clock, cipher) = (Clock::default(), tls_cipher(config.cipher));
@@ -112,7 +112,7 @@ impl Keyring {
         })
     }
 
-    /// Whether data is sealed per message.
+    /// Returns whether data is sealed per message.
     pub(crate) fn seals_messages(&self) -> bool {
         self.config.key_mode == KeyMode::Messages10
     }
@@ -123,7 +123,7 @@ impl Keyring {
         self.clock.advance(now.saturating_sub(self.clock.now()));
     }
 
-    /// The resolver for one incoming connection from a validated `source`.
+    /// Returns the resolver for one incoming connection from a validated `source`.
     pub(crate) fn resolver(&self, now: Duration, source: IpAddr) -> Arc<Resolver> {
         self.set_time(now);
         self.acceptor.resolver(source)
@@ -140,7 +140,7 @@ impl Keyring {
         &mut self.dialler
     }
 
-    /// The TLS handshake of connection `link` under `identity`, with the key `key_id`, is complete: the
+    /// Records that the TLS handshake of connection `link` under `identity`, with the key `key_id`, is complete: the
     /// key is spent. After [`Completion::First`] the ledger of used keys still has to be asked
     /// ([`poll_record`](Self::poll_record)).
     pub(crate) fn spent(
@@ -158,13 +158,13 @@ impl Keyring {
         completion
     }
 
-    /// The client at `source` proved that it is `sae`: the acceptor knows both from now on.
+    /// Records that the client at `source` proved that it is `sae`: the acceptor knows both from now on.
     pub(crate) fn authenticated(&self, now: Duration, source: IpAddr, sae: &str) {
         self.set_time(now);
         self.acceptor.authenticated(source, sae);
     }
 
-    /// A connection with the peer `sae` begins: it can receive announced keys.
+    /// Registers a new connection with the peer `sae`, on which announced keys can arrive.
     ///
     /// # Errors
     /// The SAE IDs make no channel, or the system gives no random bytes.
@@ -182,8 +182,8 @@ impl Keyring {
         Ok(())
     }
 
-    /// The connection was elected: keys may be announced on it. `first` is the key that proved the
-    /// client's name, under which the server seals its first messages.
+    /// Handles the election of a connection: keys may be announced on it. `first` is the key that proved the client's
+    /// name, under which the server seals its first messages.
     ///
     /// # Errors
     /// The connection has no receiver, the SAE IDs make no channel, or the system gives no random bytes.
@@ -209,7 +209,7 @@ impl Keyring {
         Ok(())
     }
 
-    /// A connection ended, or failed before it became a link.
+    /// Forgets a connection that ended, or that failed before it became a link.
     pub(crate) fn forget_connection(&mut self, now: Duration, connection: u64) {
         let Some(number) = self.connections.remove(&connection) else { return };
         let peer = &mut self.peers[number];
@@ -218,7 +218,7 @@ impl Keyring {
         self.touch(number);
     }
 
-    /// A key announcement came in on `connection`.
+    /// Handles a key announcement on `connection`.
     ///
     /// # Errors
     /// The peer broke a rule, or the connection has no receiver.
@@ -244,7 +244,7 @@ impl Keyring {
         }
     }
 
-    /// An answer of the KME.
+    /// Handles an answer of the KME.
     pub(crate) fn handle_answer(&mut self, now: Duration, event: KmeAnswer) -> Answered {
         self.set_time(now);
         let KmeAnswer { origin, answer } = event;
@@ -273,8 +273,8 @@ impl Keyring {
         Answered::Here
     }
 
-    /// The sender that seals for `connection`. `None` before
-    /// [`attach_sender`](Self::attach_sender), and from the time at which a successor has the keys.
+    /// Returns the sender that seals for `connection`. `None` before [`attach_sender`](Self::attach_sender), and from
+    /// the time at which a successor has the keys.
     pub(crate) fn sender(&mut self, connection: u64) -> Option<&mut KeySender> {
         let number = self.attached(connection).ok()?;
         if self.peers[number].sender.attached() != Some(connection) {
@@ -284,7 +284,7 @@ impl Keyring {
         Some(&mut self.peers[number].sender)
     }
 
-    /// The receiver that opens messages of `connection`, `None` once the connection has ended.
+    /// Returns the receiver that opens messages of `connection`, `None` once the connection has ended.
     pub(crate) fn receiver(&mut self, connection: u64) -> Option<&mut KeyReceiver> {
         let number = self.attached(connection).ok()?;
         self.touch(number);
@@ -300,7 +300,7 @@ impl Keyring {
         self.requests.pop_front()
     }
 
-    /// The next key announcement, and the connection on whose control stream it goes.
+    /// Returns the next key announcement, and the connection on whose control stream it goes.
     pub(crate) fn poll_message(&mut self, now: Duration) -> Option<(u64, KeyMessage)> {
         self.drain(now);
         loop {
@@ -311,13 +311,13 @@ impl Keyring {
         }
     }
 
-    /// The next key_ID to record in the ledger of used keys, which blocks on a file. The opening of the
+    /// Returns the next key_ID to record in the ledger of used keys, which blocks on a file. The opening of the
     /// connection takes the result (`Opening::handle_recorded`).
     pub(crate) fn poll_record(&mut self) -> Option<(u64, String)> {
         self.records.pop_front()
     }
 
-    /// The next connection whose keys changed: its flows may seal again, or its opening may be over.
+    /// Returns the next connection whose keys changed: its flows may seal again, or its opening may be over.
     pub(crate) fn poll_changed(&mut self, now: Duration) -> Option<u64> {
         self.drain(now);
         let connection = self.changed.pop_front()?;

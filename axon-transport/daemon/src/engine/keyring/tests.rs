@@ -31,7 +31,7 @@ pub(crate) fn keyring(sae: &str, key_mode: KeyMode) -> Keyring {
     Keyring::new(&config(sae, key_mode)).unwrap()
 }
 
-/// Exporters of connection `number`, the same at both ends.
+/// Returns exporters of connection `number`, the same at both ends.
 pub(crate) fn exporters(number: u8) -> Exporters {
     Exporters::new([number; 32], [!number; 32])
 }
@@ -45,7 +45,7 @@ pub(crate) fn id(text: &str) -> KeyId {
 pub(crate) struct Kmes {
     issued: u32,
     stored: HashMap<KeyId, [u8; 32]>,
-    /// How the next calls fail, the last one first.
+    /// The failures of the next calls, the last element first.
     pub(crate) failures: Vec<FailureKind>,
     /// Whether `dec_keys` gives other keys than `enc_keys` did.
     pub(crate) disagree: bool,
@@ -95,7 +95,7 @@ struct Pair {
     now: Duration,
     kmes: Kmes,
     rings: [Keyring; 2],
-    /// Messages that were said, with the index of the keyring that said them.
+    /// The messages that the keyrings sent, with the index of the sender.
     said: Vec<(usize, u64, KeyMessage)>,
 }
 

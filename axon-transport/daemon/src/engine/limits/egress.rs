@@ -1,4 +1,4 @@
-//! The bytes a second that leave this host for one identity, or by one network interface.
+//! Limits on the bytes a second that leave this host for one identity, or by one network interface.
 
 use std::{
     cell::{Cell, RefCell},
@@ -11,30 +11,30 @@ use axon_transport::{access::EgressLimit, status::LimitStatus};
 
 use super::{interfaces::InterfaceLimits, rate_bucket::BucketLevel};
 
-/// What may leave at once, in seconds of the limit, and at least in bytes: a few packets.
+/// Bucket size of a limit: seconds of the limited rate, and the minimum in bytes, which is a few packets.
 const BURST: (f64, f64) = (0.005, 6000.0);
-/// Packets are handed to the kernel together up to so many bytes.
+/// Assumed bytes of a packet, from which the number of packets to pass to the kernel together is computed.
 const PACKET: f64 = 1500.0;
-/// QUIC holds what leaves in so much longer than a round trip.
+/// Time that is added to the round trip: QUIC may hold the bytes of both.
 const AHEAD: Duration = Duration::from_millis(20);
 
 /// A limit on all packets to one identity, or by one interface.
 #[derive(Debug)]
 pub(crate) struct EgressCap {
     limit: EgressLimit,
-    /// `None`: it is on those to an identity.
+    /// The interface. `None` for a limit on the packets to an identity.
     interface: Option<String>,
     level: RefCell<BucketLevel>,
     packets: Cell<u64>,
 }
 
 impl EgressCap {
-    /// On all packets to an identity.
+    /// Creates a limit on all packets to an identity.
     pub(super) fn of_peer(limit: &EgressLimit) -> Self {
         Self::new(limit, None)
     }
 
-    /// On all packets by an interface.
+    /// Creates a limit on all packets by an interface.
     pub(super) fn of_interface(limit: &EgressLimit, interface: &str) -> Self {
         Self::new(limit, Some(interface.to_owned()))
     }
@@ -90,24 +90,24 @@ impl Egress {
         self.peer.iter().chain(&self.interface).map(|cap| &**cap)
     }
 
-    /// The status of the limits on the interface.
+    /// Returns the status of the limits on the interface.
     pub(crate) fn interface_status(&self) -> impl Iterator<Item = LimitStatus> {
         self.interface.iter().map(|cap| cap.status())
     }
 
-    /// When the next packet may leave, if not now.
+    /// Returns when the next packet may leave, if not now.
     pub(crate) fn closed_until(&self, now: Duration) -> Option<Duration> {
         let open = self.caps().map(|cap| cap.level.borrow().when(1.0));
         open.max().filter(|at| *at > now)
     }
 
-    /// How many packets may leave now.
+    /// Returns how many packets may leave now.
     pub(crate) fn packets(&self, now: Duration) -> usize {
         let left = self.caps().map(|cap| cap.level.borrow().at(now));
         left.reduce(f64::min).map_or(usize::MAX, |bytes| (bytes / PACKET).max(1.0) as usize)
     }
 
-    /// These packets left.
+    /// Records that these packets left.
     pub(crate) fn sent(&self, packets: u64, bytes: u64, now: Duration) {
         for cap in self.caps() {
             cap.level.borrow_mut().take(bytes as f64, now);
@@ -115,13 +115,13 @@ impl Egress {
         }
     }
 
-    /// Bytes a second that the slowest limit lets leave.
+    /// Returns the rate of the slowest limit, in bytes a second.
     pub(crate) fn rate(&self) -> Option<f64> {
         self.caps().map(|cap| cap.limit.bytes).reduce(f64::min)
     }
 
-    /// The congestion window, or as much as the limits let leave in a round trip. QUIC holds no more, so that samples
-    /// wait where newer ones replace them.
+    /// Returns the congestion window, or the bytes that the limits allow in a round trip and [`AHEAD`] if these are
+    /// fewer. QUIC holds no more, so that samples wait where newer ones replace them.
     pub(crate) fn window(&self, window: u64, rtt: Duration) -> u64 {
         let most = self.rate().map(|bytes| (bytes * (rtt + AHEAD).as_secs_f64()).max(2.0 * PACKET));
         most.map_or(window, |most| window.min(most as u64))

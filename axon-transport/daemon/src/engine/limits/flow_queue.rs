@@ -4,7 +4,7 @@ use std::{collections::VecDeque, time::Duration};
 
 use axon_shm::ids::Gid;
 
-/// A flow that has not asked again so long after its turn has lost it: it may be blocked, or gone.
+/// A flow that does not ask again for this time after its turn loses the turn: it may be blocked, or gone.
 const GRACE: Duration = Duration::from_millis(20);
 
 /// The flows that wait, each with the time of its turn. The first one is the next to pass.
@@ -12,14 +12,14 @@ const GRACE: Duration = Duration::from_millis(20);
 pub(super) struct FlowQueue(VecDeque<(Gid, Duration)>);
 
 impl FlowQueue {
-    /// How many flows pass before this one: all that wait, if it does not wait itself.
+    /// Returns how many flows pass before this one: all waiting flows, if it does not wait itself.
     pub(super) fn ahead_of(&mut self, flow: &Gid, now: Duration) -> usize {
         self.0.retain(|(waiting, turn)| waiting == flow || *turn + GRACE >= now);
         let place = self.0.iter().position(|(waiting, _)| waiting == flow);
         place.unwrap_or(self.0.len())
     }
 
-    /// The flow waits, and its turn is at this time.
+    /// Records that the flow waits for its turn at this time.
     pub(super) fn wait(&mut self, flow: &Gid, turn: Duration) {
         match self.0.iter_mut().find(|(waiting, _)| waiting == flow) {
             Some((_, before)) => *before = turn,
@@ -27,7 +27,7 @@ impl FlowQueue {
         }
     }
 
-    /// The flow waits no more.
+    /// Removes the flow from the queue.
     pub(super) fn leave(&mut self, flow: &Gid) {
         if !self.0.is_empty() {
             self.0.retain(|(waiting, _)| waiting != flow);
@@ -51,7 +51,7 @@ mod tests {
         line.leave(&a);
         line.wait(&a, now + GRACE);
         assert_eq!([a, b].map(|flow| line.ahead_of(&flow, now)), [1, 0]);
-        // A flow that does not come for its turn is in nobody's way.
+        // A flow that does not use its turn holds up no other flow.
         assert_eq!(line.ahead_of(&a, now + 3 * GRACE), 0);
     }
 }

@@ -1,4 +1,4 @@
-//! The bytes a second that leave this host by one network interface, for all peers together.
+//! Limits on the bytes a second that leave this host by one network interface, for all peers together.
 
 use std::{collections::BTreeMap, net::IpAddr, rc::Rc};
 
@@ -12,12 +12,12 @@ use crate::discovery::Interface;
 pub(crate) struct InterfaceLimits {
     rules: Vec<InterfaceLimit>,
     known: Vec<Interface>,
-    /// By the name of the interface. They stay while a rule sets them, so that no interface that comes back has a full
-    /// bucket.
+    /// The limits by the name of the interface. A limit stays while a rule sets it, so that an interface that comes
+    /// back does not start with a full bucket.
     caps: BTreeMap<String, Vec<Rc<EgressCap>>>,
-    /// Whether the owner was asked for the interfaces, and has not answered.
+    /// Whether the owner was asked for the list of interfaces, and has not answered.
     is_asked: bool,
-    /// Whether it has to be asked again.
+    /// Whether the owner has to be asked again.
     is_wanted: bool,
 }
 
@@ -41,7 +41,7 @@ impl InterfaceLimits {
         self.is_wanted = !self.rules.is_empty();
     }
 
-    /// Whether the owner has to be asked for the interfaces now. At most one question is open.
+    /// Returns whether the owner has to be asked for the interfaces now. At most one question is open.
     pub(crate) fn asks(&mut self) -> bool {
         let asks = self.is_wanted && !self.is_asked;
         if asks {
@@ -71,15 +71,16 @@ impl InterfaceLimits {
         }
     }
 
-    /// The limits on what leaves from a local address.
+    /// Returns the limits on packets that leave from a local address.
     pub(super) fn of(&self, local: IpAddr) -> &[Rc<EgressCap>] {
         let interface = self.interface(local);
         interface.and_then(|interface| self.caps.get(&interface.name)).map_or(&[], Vec::as_slice)
     }
 
-    /// Whether limits may not act on what leaves from a local address, since no interface is known to have it.
+    /// Returns whether the limits on packets from a local address may be missing, because no known interface has the
+    /// address.
     pub(crate) fn misses(&self, local: IpAddr) -> bool {
-        // The first list is under way.
+        // An empty list means that the first list has not arrived yet.
         let is_listed = !self.known.is_empty();
         is_listed && !self.rules.is_empty() && self.interface(local).is_none()
     }

@@ -4,18 +4,18 @@ use std::time::Duration;
 
 use axon_transport::access::RateLimit;
 
-/// What rounding may take from a whole sample.
+/// Tolerance for the rounding error of a whole sample.
 const ROUNDING: f64 = 1e-6;
 
-/// The shortest time between two samples that flows wait for.
+/// Minimum time between two samples for which flows wait.
 const SHORTEST: Duration = Duration::from_micros(100);
 
-/// What may pass, as it grows back with time.
+/// The level of a bucket, which refills over time.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct BucketLevel {
     a_second: f64,
     most: f64,
-    /// Below zero where more passed than there was.
+    /// The amount at `at`. It is negative if more has passed than there was.
     left: f64,
     at: Duration,
 }
@@ -34,7 +34,7 @@ impl BucketLevel {
         (self.left, self.at) = (self.at(now) - amount, now);
     }
 
-    /// When there is, or was, so much.
+    /// Returns the time at which the level reaches `amount`. That time may have passed.
     pub(super) fn when(&self, amount: f64) -> Duration {
         let missing = amount - self.left;
         if missing <= ROUNDING {
@@ -44,7 +44,7 @@ impl BucketLevel {
     }
 }
 
-/// A bucket. A sample passes while there is room for one of any length: a long one is made up for before the next.
+/// A rate bucket. A sample of any length passes if the bucket is open; a long one delays the next sample.
 #[derive(Debug)]
 pub(super) struct RateBucket {
     samples: Option<BucketLevel>,
@@ -54,24 +54,24 @@ pub(super) struct RateBucket {
 }
 
 impl RateBucket {
-    /// A full one.
+    /// Creates a full bucket.
     pub(super) fn new(limit: &RateLimit) -> Self {
         let burst = f64::from(limit.burst.get());
         Self {
             samples: limit.rate.map(|rate| BucketLevel::full(rate, burst)),
-            // A hundredth of a second's, so that a timer that is late costs nothing.
+            // The bucket of bytes holds a hundredth of a second, so that a late timer loses nothing.
             bytes: limit.bytes.map(|bytes| BucketLevel::full(bytes, (bytes / 100.0).max(1.0))),
             last: 1.0,
         }
     }
 
-    /// When the next sample may pass; that may have been long ago.
+    /// Returns when the next sample may pass; this time may have passed long ago.
     pub(super) fn open_at(&self) -> Duration {
         let (samples, bytes) = (self.samples.map(|s| s.when(1.0)), self.bytes.map(|b| b.when(1.0)));
         samples.max(bytes).unwrap_or_default()
     }
 
-    /// The time between two samples, if they are as long as the last one.
+    /// Returns the time between two samples that are as long as the last one.
     pub(super) fn interval(&self) -> Duration {
         let samples = self.samples.map(|level| 1.0 / level.a_second);
         let bytes = self.bytes.map(|level| self.last / level.a_second);
@@ -79,7 +79,7 @@ impl RateBucket {
         Duration::from_secs_f64(seconds).max(SHORTEST)
     }
 
-    /// How many samples may pass now, if they are as long as the last one.
+    /// Returns how many samples may pass now, if they are as long as the last one.
     pub(super) fn passes(&self, now: Duration) -> usize {
         if self.open_at() > now {
             return 0;
@@ -89,7 +89,7 @@ impl RateBucket {
         (samples.min(bytes) as usize).max(1)
     }
 
-    /// A sample of this length passes.
+    /// Records that a sample of this length passes.
     pub(super) fn pass(&mut self, length: usize, now: Duration) {
         let length = length as f64;
         if let Some(level) = &mut self.samples {
@@ -140,7 +140,7 @@ mod tests {
         assert_eq!(bucket.passes(ms(105)), 1);
         bucket.pass(1000, ms(105));
         assert!((ms(50)..ms(51)).contains(&bucket.wait(ms(155))));
-        // A long pause gives the burst again, and no more.
+        // A long pause fills the bucket with one burst, and no more.
         assert_eq!(bucket.passes(ms(100_000)), 3);
     }
 

@@ -1,4 +1,4 @@
-//! From a dial, or an incoming handshake, to a link that awaits its election.
+//! The states from a dial, or an incoming handshake, to a link that awaits its election.
 
 pub(crate) mod dialling;
 pub(crate) mod failure;

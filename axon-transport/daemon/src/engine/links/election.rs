@@ -248,7 +248,7 @@ impl Links {
         if superseded {
             tracing::debug!(peer = %daemon, "a newer link was elected before this one's ELECTED arrived");
             if let Some(peer) = self.table.peer_mut(number) {
-                // Nothing is sent over it: its keys are not needed.
+                // Nothing is sent over a superseded link, so it needs no keys.
                 peer.sealing = None;
             }
             self.hand_over(number, now);
@@ -323,7 +323,7 @@ impl Links {
         true
     }
 
-    /// Tells the peer how much it may have in flight.
+    /// Tells the peer how many bytes it may have in flight.
     fn send_receive_limits(&mut self, number: u64, now: Duration) {
         let Some(peer) = self.table.peer(number) else { return };
         let (unread, messages) = (window(peer).into(), MESSAGES.0 as u64);

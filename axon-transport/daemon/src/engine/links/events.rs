@@ -23,7 +23,7 @@ pub(in crate::engine) enum LinkEvent {
         /// The message to send over the new link.
         closed: Option<LinkClosed>,
     },
-    /// A message on the link in use, with what it weighs on the peer's account until it is handled.
+    /// A message on the link in use, and its charge on the peer's account until it is handled.
     Message(u64, DaemonId, Box<LinkMessage>, Option<Charge>),
     /// An event of a data stream of any link of this peer.
     Stream(u64, DaemonId, StreamEvent),

@@ -294,7 +294,7 @@ impl Links {
             // Data is sent over unidirectional streams.
             StreamEvent::Readable { id } if id.dir() == Dir::Bi => {}
             event => {
-                // Before the election a link carries no samples, whatever identity its peer claims.
+                // Before the election a link carries no samples, for any identity that its peer claims.
                 let carries = |link: &&Link| link.carries() || link.carries_copies();
                 let link = self.table.get(number).filter(carries);
                 let peer = link.and_then(|link| link.peer.as_ref());

@@ -1,9 +1,9 @@
 //! Finds lost packets of short samples early on links that lose many.
 //!
-//! QUIC notices that a packet is lost when a later one is acknowledged. A camera sends later ones all the time. A
-//! command does not: then QUIC waits for a timer that doubles each time, and at 40 % of loss that soon takes longer
-//! than a command is worth. So while samples are on the way over a link that loses packets, and no other was handed to
-//! QUIC, a PING follows them every few milliseconds. Each one that is acknowledged shows which packets before it are
+//! QUIC detects the loss of a packet when a later packet is acknowledged. A camera sends later packets all the time,
+//! but a command does not. QUIC then waits for a timer that doubles each time. At 40 % of loss this soon takes longer
+//! than a command is useful. So while samples are in flight over a link that loses packets, and no other sample was
+//! handed to QUIC, a PING follows them every few milliseconds. Each acknowledged PING shows which packets before it are
 //! lost.
 
 use std::{collections::HashMap, time::Duration};

@@ -173,7 +173,7 @@ impl ServedFlows {
     pub(super) fn give_up_ended(&self, of: &Gid) -> u64 {
         let mut most = 0;
         for source in self.sources.iter().filter(|source| source.reads(of)) {
-            // No more samples of it are sent.
+            // Its remaining samples are not sent any more.
             let taken = std::iter::from_fn(|| source.take_of(of, Duration::ZERO)).count();
             source.acknowledge_of(of, u64::MAX);
             most = most.max(taken as u64);

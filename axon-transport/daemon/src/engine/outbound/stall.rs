@@ -43,9 +43,9 @@ pub(super) struct FlowStalls {
     flows: HashMap<FlowId, Progress>,
     /// The number of the peer's frames, and the time of the last change.
     heard: (u64, Duration),
-    /// How often credit was returned.
+    /// The number of times that the peer returned credit.
     returned: u64,
-    /// How long flows have waited for credit since some was last returned.
+    /// The time for which flows have waited for credit since the peer last returned some.
     starved: Duration,
     /// When time was last counted.
     looked: Duration,
@@ -84,7 +84,7 @@ struct Pace {
 pub(super) struct PeerActivity {
     /// Frames that arrived over the link.
     pub(super) heard: u64,
-    /// How often credit was returned.
+    /// The number of times that the peer returned credit.
     pub(super) returned: u64,
     /// True if a flow waits for credit.
     pub(super) is_awaited: bool,
@@ -101,7 +101,7 @@ pub(super) struct BusyFlow {
     pub(super) progress: (u64, u64),
     /// Samples that a KEEP_ALL relay makes its publisher keep; `None` if there are none.
     pub(super) keeps: Option<u64>,
-    /// How many publishes found no room, if that relay may be the reason for the next one.
+    /// The number of publishers that found no room, if this relay may be the reason for the next one.
     pub(super) refused: Option<u64>,
     /// True if the flow belongs to a service: calls may wait for a slow server while there is room for
     /// further calls.

@@ -146,7 +146,7 @@ impl Peer {
         }
         self.inbound.handle_routes();
         if given_up > 0 {
-            // Other routes, which the peer refused, may take the place of these.
+            // Routes that the peer refused may take the place of the given-up routes.
             let instead = self.refused.unserved_without_time(given_up);
             self.ask_again(&instead);
         }

@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 
 use crate::link::{LinkClosed, LinkMessage};
 
-/// Most closed links that are reported to the peer again: as many as may wait for their end.
+/// Maximum number of closed links that are reported to the peer again: as many as may wait for their end.
 const SAID_CLOSED: usize = 8;
 
 /// Control messages for one peer, in order.

@@ -1,5 +1,5 @@
-//! The graph of this host that one peer is shown: live endpoints that the peer may see, and ended publishers whose
-//! samples have not all arrived there.
+//! The graph of this host as one peer sees it: live endpoints that the peer may see, and ended publishers whose samples
+//! have not all arrived there.
 
 use std::{collections::BTreeMap, sync::Arc, time::Duration};
 
@@ -17,7 +17,7 @@ use crate::{
     owner::ChannelBinding,
 };
 
-/// The graph of this host that one peer is shown.
+/// The graph of this host as one peer sees it.
 pub(super) struct LocalGraph {
     peer: DaemonId,
     /// The graph that was sent to the peer.

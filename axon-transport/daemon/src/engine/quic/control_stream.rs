@@ -194,7 +194,7 @@ impl ControlStream {
     /// Hands frames to QUIC. Returns whether it took any.
     pub(in crate::engine) fn write(&mut self, quic: &mut quinn_proto::Connection) -> bool {
         let Some(stream) = self.stream else { return false };
-        // Control messages are small, and go first whatever other data QUIC holds.
+        // Control messages are small, and go before all other data that QUIC holds.
         quic.set_send_window(u64::MAX);
         let mut wrote = false;
         while let Some((frame, _)) = self.out.front_mut() {

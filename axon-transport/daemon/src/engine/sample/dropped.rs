@@ -12,11 +12,11 @@ const RUNS: usize = 64;
 struct Run {
     first: u64,
     last: u64,
-    /// How many of the numbers were dropped.
+    /// The number of dropped samples in the range.
     dropped: u64,
 }
 
-/// What became of a sample at its first arrival.
+/// The result of a sample's first arrival.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum EarlierFate {
     /// The sample was dropped, as far as is known.
@@ -72,12 +72,12 @@ impl DroppedRuns {
         }
     }
 
-    /// Returns what became of a sample that arrives again.
+    /// Returns the result of the first arrival of a sample that arrives again.
     pub(in crate::engine) fn find(&self, sequence: u64) -> EarlierFate {
         let at = self.0.partition_point(|run| run.last < sequence);
         match self.0.get(at) {
-            // The last numbers of a run count as dropped, whichever really were. So any repeated end of a run
-            // reports no fewer than were dropped in it.
+            // The last numbers of a run count as dropped, even if earlier numbers were dropped in fact. So any repeated
+            // end of a run reports at least as many as were dropped in it.
             Some(run) if run.last - sequence < run.dropped => EarlierFate::Dropped,
             Some(run) if sequence >= run.first => EarlierFate::Passed,
             _ => EarlierFate::Unknown,
@@ -128,7 +128,7 @@ mod tests {
             assert!(told <= truth + all / 3 + 2, "from {number} of {newest}: {told} of {truth}");
         }
         assert_eq!(told, truth, "all");
-        // None that was dropped is delivered when it comes again.
+        // No dropped sample is delivered when it comes again.
         let mut delivered =
             (1..=newest).filter(|n| is(*n) && dropped.find(*n) == EarlierFate::Unknown);
         assert_eq!(delivered.next(), None);

@@ -3,7 +3,7 @@
 
 use bytes::Bytes;
 
-/// Up to here a payload is copied to its neighbours.
+/// Maximum length of a payload that is copied next to its neighbours.
 const COPIED: usize = 4096;
 
 /// The frames of some messages, one after the other.
@@ -11,12 +11,12 @@ const COPIED: usize = 4096;
 pub(crate) struct Frames {
     /// Complete pieces.
     pieces: Vec<Bytes>,
-    /// The piece that grows.
+    /// The piece under construction.
     growing: Vec<u8>,
 }
 
 impl Frames {
-    /// Has room for so many bytes that are copied, in one allocation.
+    /// Reserves room in one allocation for this many copied bytes.
     pub(crate) fn reserve(&mut self, bytes: usize) {
         self.growing.reserve_exact(bytes);
     }
@@ -35,8 +35,8 @@ impl Frames {
         self.pieces.push(payload.clone());
     }
 
-    /// Has `write` add so many bytes at most to those that it is given, and no more, in memory of their own where they
-    /// are many. If it fails, nothing is added.
+    /// Calls `write`, which must append at most `most` bytes to its buffer. If `most` is large, the bytes get an
+    /// allocation of their own. If `write` fails, nothing is added.
     pub(crate) fn append<E>(
         &mut self,
         most: usize,
@@ -54,13 +54,13 @@ impl Frames {
         written
     }
 
-    /// Takes what there is.
+    /// Takes all pieces.
     pub(crate) fn take(&mut self) -> Vec<Bytes> {
         self.close();
         std::mem::take(&mut self.pieces)
     }
 
-    /// Bytes since the last [`take`](Self::take).
+    /// Returns the number of bytes since the last [`take`](Self::take).
     pub(crate) fn len(&self) -> usize {
         self.pieces.iter().map(Bytes::len).sum::<usize>() + self.growing.len()
     }

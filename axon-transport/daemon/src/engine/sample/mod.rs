@@ -1,4 +1,4 @@
-//! How a sample stands in a data stream, and what its number tells.
+//! The form of a sample in a data stream, and checks of its number.
 
 pub(super) mod dropped;
 pub(crate) mod frames;

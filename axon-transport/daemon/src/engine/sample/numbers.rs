@@ -1,22 +1,22 @@
-//! Judges the numbers of a remote publisher's samples by what it can have published. A peer may say any number, and
-//! what is missing between two numbers counts as lost for good.
+//! Judges the numbers of a remote publisher's samples against the number of samples that it can have published. A peer
+//! may send any number, and a gap between two numbers counts as lost for good.
 
 use std::{cell::Cell, time::Duration};
 
-/// Samples that a publisher may have published before the first one that comes here.
+/// Maximum number of samples that a publisher may have published before the first one that arrives here.
 const MAX_FIRST: u64 = 1 << 48;
-/// Nanoseconds that no publisher is faster than for a sample, read or not.
+/// Minimum time, in nanoseconds, that any publisher needs for a sample.
 const NANOS: u64 = 125;
-/// The same as a rate a second.
+/// The same limit as a rate: samples a second.
 const RATE: u64 = 1_000_000_000 / NANOS;
-/// Samples that a ring may hold between the one that was taken last and the next that still stands.
+/// Maximum number of samples that a ring may hold between the last taken sample and the next one that is still valid.
 const SLACK: u64 = 1 << 20;
-/// The longest time that a sample is on its way before a later one comes with it: as long as a silent link stands.
+/// Maximum time for which a sample is on its way before a later one comes with it: the lifetime of a silent link.
 const ON_THE_WAY: Duration = Duration::from_secs(120);
-/// After this time nothing is refused that a reader would count: it ignores larger gaps.
+/// After this time no gap is refused that a reader would count, because readers ignore larger gaps.
 pub(in crate::engine) const FORGOTTEN: Duration = Duration::from_secs((1 << 32) / RATE + 1);
 
-/// So many samples a publisher can publish in this time.
+/// Returns how many samples a publisher can publish in this time.
 fn samples_in(time: Duration) -> u64 {
     time.as_secs().saturating_mul(RATE).saturating_add(u64::from(time.subsec_nanos()) / NANOS)
 }
@@ -26,23 +26,23 @@ fn samples_in(time: Duration) -> u64 {
 pub(in crate::engine) struct PublisherNumbers {
     /// The highest number that was written; 0 is none.
     last: Cell<u64>,
-    /// By how much the next number may exceed it, as it was at `at`.
+    /// Maximum distance of the next number from `last`, as of the time `at`.
     ahead: Cell<u64>,
     at: Cell<Duration>,
 }
 
 impl PublisherNumbers {
-    /// None came yet.
+    /// Creates the state of a publisher without a sample.
     pub(in crate::engine) fn new(now: Duration) -> Self {
         Self { last: Cell::new(0), ahead: Cell::new(SLACK), at: Cell::new(now) }
     }
 
-    /// The highest number that was written; 0 is none.
+    /// Returns the highest number that was written; 0 is none.
     pub(in crate::engine) fn last(&self) -> u64 {
         self.last.get()
     }
 
-    /// The highest number that the publisher can have reached.
+    /// Returns the highest number that the publisher can have reached.
     fn most(&self, now: Duration) -> u64 {
         match self.last.get() {
             0 => MAX_FIRST,
@@ -54,10 +54,10 @@ impl PublisherNumbers {
         self.ahead.get().saturating_add(samples_in(now.saturating_sub(self.at.get())))
     }
 
-    /// Whether a sample may have this number.
+    /// Checks that a sample may have this number.
     ///
     /// # Errors
-    /// It cannot; the text says why.
+    /// The publisher cannot have reached it; the text says so.
     pub(in crate::engine) fn judge(&self, sequence: u64, now: Duration) -> Result<(), String> {
         let most = self.most(now);
         if sequence <= most {
@@ -69,17 +69,17 @@ impl PublisherNumbers {
         ))
     }
 
-    /// A sample of this number was written.
+    /// Records that a sample of this number was written.
     pub(in crate::engine) fn pass(&self, sequence: u64, now: Duration) {
         let last = self.last.replace(sequence.max(self.last.get()));
-        // This one may have been on its way for so long, and a later one comes with it.
+        // This sample may have been on its way for this long, and a later one may come right after it.
         let most = SLACK + samples_in(ON_THE_WAY);
         let used = if last == 0 { 0 } else { sequence.saturating_sub(last) };
         self.ahead.set(self.ahead(now).saturating_sub(used).min(most));
         self.at.set(now);
     }
 
-    /// When its last number came, or when it began.
+    /// Returns when the last number came, or else when the state was created.
     pub(in crate::engine) fn at(&self) -> Duration {
         self.at.get()
     }
@@ -103,7 +103,7 @@ mod tests {
         numbers.judge(8 + SLACK, at(0)).unwrap_err();
         numbers.judge(7 + SLACK + RATE, at(1)).unwrap();
         numbers.judge(8 + SLACK + RATE, at(1)).unwrap_err();
-        // After days it is what can have been lost.
+        // After days a gap may be as large as the number of samples that can have been lost.
         numbers.judge(7 + SLACK + 200_000 * RATE, at(200_000)).unwrap();
     }
 
@@ -126,7 +126,7 @@ mod tests {
         numbers.pass(1, at(0));
         numbers.pass(2, at(100));
         numbers.judge(2 + 99 * RATE, at(100)).unwrap();
-        // But not the sum of all such times.
+        // The lead is not the sum of all these times.
         numbers.pass(3, at(10_000));
         numbers.judge(3 + SLACK + 121 * RATE, at(10_000)).unwrap_err();
     }

@@ -1,4 +1,5 @@
-//! How a message stands in a data stream: behind its length, in `messages10` sealed as an AXQKD001 envelope.
+//! The form of a message in a data stream: its length, then the message, which in `messages10` is sealed as an AXQKD001
+//! envelope.
 
 use std::time::Duration;
 
@@ -36,28 +37,29 @@ pub(crate) enum Seal<'a> {
 }
 
 impl Seal<'_> {
-    /// The sender will need keys for so many messages more.
+    /// Announces that the sender will need keys for this many more messages.
     pub(crate) fn demand(&mut self, messages: u32, now: Duration) {
         if let Self::Envelope { sender, .. } = self {
             sender.demand(now, messages);
         }
     }
 
-    /// Whether this host's KME gives no keys for the peer, and none is left.
+    /// Returns whether this host's KME gives no keys for the peer, and none is left.
     pub(crate) fn lacks_keys_of_kme(&self) -> bool {
         matches!(self, Self::Envelope { sender, .. } if sender.lacks_keys_of_kme())
     }
 
-    /// The short headers of a new stream, if its messages have such: within an envelope stands the inner header.
+    /// Returns the short headers for a new stream, if its messages have short headers: an envelope contains the inner
+    /// header.
     pub(crate) fn short_headers(&self) -> Option<ShortHeaders> {
         matches!(self, Self::Link).then(ShortHeaders::default)
     }
 
-    /// Adds a message to `frames`, behind its inner header or, in a stream that has such, a short one. That says nothing of
-    /// compression: a compressed sample is not sent over such a stream.
+    /// Adds a message to `frames`, behind its inner header or, with `short`, behind a short one. A short header cannot
+    /// mark compression, so a compressed sample is not sent over a stream with short headers.
     ///
     /// # Errors
-    /// There is no key for it. Nothing is added then.
+    /// There is no key for the message. Nothing is added then.
     pub(crate) fn write(
         &mut self,
         sample: &RingSample,
@@ -94,7 +96,7 @@ impl Seal<'_> {
                 let length = slot.overhead() + header.len() + sample.payload.len();
                 frames.append(LENGTH + length, |frame| {
                     frame.extend_from_slice(&(length as u32).to_be_bytes());
-                    // Sealed where it leaves from.
+                    // The message is sealed in the buffer from which it is sent.
                     let at = frame.len();
                     frame.resize(at + slot.header_len(), 0);
                     frame.extend_from_slice(&header);
@@ -115,12 +117,12 @@ fn plain(header: &[u8], payload: &Bytes, frames: &mut Frames) {
     frames.share(payload);
 }
 
-/// A sample's age in milliseconds.
+/// Returns a sample's age in milliseconds.
 fn age(sample: &RingSample, now: Duration) -> u32 {
     u32::try_from(sample.age(now).as_millis()).unwrap_or(u32::MAX)
 }
 
-/// The header of a message.
+/// Returns the header of a message.
 fn header(sample: &RingSample, now: Duration) -> inner::Header {
     inner::Header {
         gid: sample.info.publisher.0,
@@ -133,7 +135,7 @@ fn header(sample: &RingSample, now: Duration) -> inner::Header {
     }
 }
 
-/// A call of a client. Its number is signed in ROS 2.
+/// Returns the id of a client's call. ROS 2 has signed numbers.
 pub(crate) fn call(client: Gid, sequence: u64) -> inner::RequestId {
     inner::RequestId { client: client.0, sequence: i64::try_from(sequence).unwrap_or(i64::MAX) }
 }
@@ -153,13 +155,13 @@ pub(crate) enum Open<'a> {
 
 /// A message that was opened.
 pub(crate) struct OpenedSample<'a> {
-    /// Its header.
+    /// The header of the message.
     pub(crate) header: inner::Header,
     sent: &'a [u8],
 }
 
 impl<'a> OpenedSample<'a> {
-    /// A message without an envelope.
+    /// Parses a message without an envelope.
     ///
     /// # Errors
     /// The peer broke the format.
@@ -169,13 +171,13 @@ impl<'a> OpenedSample<'a> {
         Ok(Self { header, sent })
     }
 
-    /// The payload as it was sent: compressed, if the header says so.
+    /// Returns the payload as it was sent: compressed, if the header says so.
     pub(crate) fn sent(&self) -> &'a [u8] {
         self.sent
     }
 }
 
-/// The length that a compressed payload will have, at most `most`.
+/// Returns the length of the payload after decompression, at most `most`.
 ///
 /// # Errors
 /// It would be longer.
@@ -188,7 +190,7 @@ pub(crate) fn unpacked_length(header: &inner::Header, most: u64) -> Result<usize
     Ok(length as usize)
 }
 
-/// Decompresses a payload that will have this length.
+/// Decompresses a payload to this length.
 ///
 /// # Errors
 /// The peer broke the format.
@@ -221,8 +223,9 @@ impl Open<'_> {
     }
 }
 
-/// The writer of a message on the stream of publisher, or client, `of`. The header of a response has the number of the
-/// call twice, or, if it is `numbered`, its own number in the flow and that of the call.
+/// Returns the writer of a message on the stream of publisher, or client, `of`. The header of a response contains the
+/// number of the call twice. If the response is `numbered`, the header contains its own number in the flow and the
+/// number of the call.
 ///
 /// # Errors
 /// The message names another writer or call than its stream.
@@ -245,7 +248,7 @@ pub(crate) fn writer_of(
     if fits { Ok(writer) } else { Err("a message names another publisher or call than its stream") }
 }
 
-/// Why a message is refused.
+/// The reason why a message is refused.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub(crate) enum RefusedMessage {
@@ -255,19 +258,19 @@ pub(crate) enum RefusedMessage {
         /// Cause for log and status.
         text: String,
     },
-    /// The inner header or the compression.
+    /// The inner header or the compression is malformed.
     #[error("{0}")]
     Malformed(String),
 }
 
 impl RefusedMessage {
-    /// An envelope that was refused.
+    /// Makes the refusal of an envelope.
     pub(crate) fn of_envelope(error: &OpenError) -> Self {
         Self::Envelope { text: cause(error) }
     }
 }
 
-/// For the local log: never told to the peer.
+/// Returns the cause for the local log, which a peer never gets.
 fn cause(error: &OpenError) -> String {
     match error.cause() {
         Some(cause) => format!("envelope refused: {cause}"),

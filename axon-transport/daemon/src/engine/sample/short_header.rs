@@ -1,13 +1,14 @@
-//! The short header of a topic's sample: what of an inner header its data stream does not tell.
+//! The short header of a topic's sample: the part of an inner header that its data stream does not determine.
 //!
-//! The stream names the publisher, and number and time are told as differences to those of the sample before it on the
-//! stream. Three numbers follow each other in LEB128: the number's difference, that of the source timestamp in zigzag,
-//! and the age in milliseconds. So most samples have 4 to 7 bytes of it where an inner header has 64.
+//! The stream names the publisher. The number and the time are coded as differences from those of the stream's previous
+//! sample. A header consists of three LEB128 numbers: the difference of the sequence numbers, the difference of the
+//! source timestamps in zigzag coding, and the age in milliseconds. So most short headers take 4 to 7 bytes, where an
+//! inner header takes 64.
 
 /// The longest header: two numbers of 64 bits and one of 32.
 const MAX_HEADER_BYTES: usize = 10 + 10 + 5;
 
-/// What is told of a sample.
+/// The content of a short header.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct ShortHeader {
     pub(crate) sequence: u64,
@@ -16,7 +17,8 @@ pub(crate) struct ShortHeader {
     pub(crate) age_ms: u32,
 }
 
-/// The short headers of one stream, on either side: the last one counts for the next. It begins with zeros.
+/// The coder for the short headers of one stream, on either side. Each header depends on the one before; the state
+/// begins with zeros.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct ShortHeaders {
     sequence: u64,
@@ -30,7 +32,7 @@ pub(crate) struct Encoded {
 }
 
 impl Encoded {
-    /// The bytes.
+    /// Returns the bytes.
     pub(crate) fn as_slice(&self) -> &[u8] {
         &self.bytes[..self.length]
     }

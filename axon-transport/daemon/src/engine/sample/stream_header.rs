@@ -1,4 +1,4 @@
-//! The header of a data stream: what the stream carries, and for which route.
+//! The header of a data stream, which states the content of the stream and its route.
 
 use axon_shm::ids::Gid;
 
@@ -8,7 +8,7 @@ pub(in crate::engine) const HEADER: usize = 24;
 const RELIABLE: u8 = 1;
 /// A stream of one BEST_EFFORT sample.
 const BEST_EFFORT: u8 = 2;
-/// A stream of the copy of one RELIABLE sample, request or response, over the link that stands by.
+/// A stream of the copy of one RELIABLE sample, request or response, over the standby link.
 const COPY: u8 = 3;
 /// A flag: the messages have short headers.
 const SHORT_HEADERS: u8 = 1;
@@ -20,7 +20,7 @@ const ACKNOWLEDGED: u8 = 2;
 pub(crate) struct StreamHeader {
     /// True if it carries RELIABLE samples, requests or responses, one after the other.
     pub(crate) reliable: bool,
-    /// True if it carries the copy of one of these.
+    /// True if it carries the copy of one such sample, request or response.
     pub(crate) copy: bool,
     /// True if its messages have short headers.
     pub(crate) short: bool,

@@ -8,8 +8,8 @@ pub(super) use self::shares::HandshakeSlot;
 pub(crate) use self::shares::place;
 use self::shares::{HandshakeShares, LoggedRefusals, gives_way};
 
-/// Maximum number of handshakes under way at once, without those of listed peers; further dials are refused and come
-/// again.
+/// Maximum number of handshakes under way at once, without the handshakes of listed peers; the peer repeats a refused
+/// dial.
 const MAX_HANDSHAKES: usize = 64;
 
 /// The handshakes and links of peers by address, and their limits.

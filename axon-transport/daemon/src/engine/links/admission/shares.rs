@@ -49,8 +49,8 @@ impl HandshakeShares {
         Rc::new(Self { most, under_way: RefCell::default() })
     }
 
-    /// Returns a place for one more handshake from this address. An address may have as many as are free, so another
-    /// address always finds one. A listed peer has some places that no other peer gets.
+    /// Returns a place for one more handshake from this address. An address may have at most as many places as are
+    /// free, so another address always finds one. A listed peer has some places that no other peer gets.
     pub(crate) fn enter(self: &Rc<Self>, address: IpAddr, listed: bool) -> Option<HandshakeSlot> {
         let at = place(address);
         let mut under_way = self.under_way.borrow_mut();

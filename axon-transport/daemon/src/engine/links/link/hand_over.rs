@@ -1,11 +1,11 @@
-//! How far a link is whose successor took over.
+//! The progress of a link whose successor took over.
 
 use std::time::Duration;
 
 /// Time of one wait for the peer.
 const HAND_OVER: Duration = Duration::from_secs(5);
 
-/// How far a link is whose successor took over.
+/// The progress of a link whose successor took over.
 ///
 /// It closes once everything has arrived in both directions: this side's streams are sent, and the peer, which sends
 /// over the successor, has ended its control stream or has waited for this side for long enough. If the link is silent,

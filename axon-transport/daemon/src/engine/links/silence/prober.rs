@@ -270,7 +270,7 @@ mod tests {
 
     #[test]
     fn several_short_returns_end_within_500_ms_of_the_last_one() {
-        // How often the path returns, for how long it works, and for how long it does not.
+        // Tries several numbers of returns of the path, and times for which it works and does not.
         for returns in 1..6 {
             for (works, cut) in [(50, 1_000), (100, 1_800), (300, 2_500), (700, 5_000)] {
                 let [works, cut] = [works, cut].map(Duration::from_millis);
@@ -294,7 +294,7 @@ mod tests {
         let mut prober = Prober::new(Side::Client);
         let mut dials = Vec::new();
         for _ in 0..6 {
-            // Of three probes one is answered.
+            // One of three probes is answered.
             let number = Cell::new(0);
             let answered = |_| {
                 number.set(number.get() + 1);

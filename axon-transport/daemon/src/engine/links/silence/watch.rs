@@ -13,7 +13,7 @@ const OUTLIVED: Duration = Duration::from_secs(3);
 /// Time of silence after which a peer counts as gone. Its link stays until QUIC gives it up.
 const GONE: Duration = Duration::from_secs(20);
 
-/// The state of a peer's answers over its link. A state machine as `docs/architecture.md` describes them.
+/// The state of a peer's answers over its link. It is a state machine as described in `docs/architecture.md`.
 ///
 /// A link is *unheard* while nothing arrives, *probed* once something was asked and nothing arrived for a second,
 /// *silent* once its path was found cut or a successor was dialled, and its peer is *gone* after a longer time. An
@@ -279,7 +279,7 @@ mod tests {
         };
         for answered in [false, true] {
             let found: Vec<_> = (0..20).map(|_| probe(&mut silence).1).collect();
-            // Three probes are unanswered when the fourth is sent. That is reported again after a while.
+            // The fourth probe is sent when three are unanswered. The cut is reported again after a while.
             let said = |action: &ProbeAction| *action == ProbeAction::ProbeCut(NONCE);
             let said: Vec<_> = (0..).zip(&found).filter(|(_, a)| said(a)).map(|(n, _)| n).collect();
             assert_eq!(said, [3, 19]);

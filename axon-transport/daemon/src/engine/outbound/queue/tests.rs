@@ -45,7 +45,7 @@ fn keep_last_that_is_behind_holds_its_depth_and_the_newest() {
     for sequence in 1..=10 {
         dropped(queue.offer(sample(sequence, 100, at(0)), at(0)));
     }
-    // What is too much of the burst makes way for a newer sample, and for that alone.
+    // A newer sample evicts the excess samples of the burst. Nothing else evicts them.
     assert!(queue.wants_more(at(499)) && queue.wants_more(at(500)));
     assert_eq!(queue.waiting(), 10);
     assert_eq!(dropped(queue.offer(sample(11, 100, at(600)), at(600))), 9);

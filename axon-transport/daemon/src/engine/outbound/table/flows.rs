@@ -10,8 +10,8 @@ use crate::engine::{
     rank::FlowId,
 };
 
-/// Number of flows that one search for idle streams checks: all that have a stream. The peer may acknowledge all of
-/// them at once, and no further acknowledgement would begin another search.
+/// Number of flows that one search for idle streams checks: all flows that have a stream. The peer may acknowledge all
+/// of them at once, and no further acknowledgement would begin another search.
 const SEARCHED: usize = STREAMS_OPEN as usize;
 
 /// A flow, and the time in `timers` at which its timer is due.

@@ -293,11 +293,11 @@ impl RefusedRoutes {
 /// The side that prevents a route.
 #[derive(Clone, Copy)]
 pub(in crate::engine::peer) enum RefusedSide {
-    /// This host, which reads.
+    /// The reading side is this host.
     NotAsked,
     /// The peer, which writes.
     Peer,
-    /// This host, which writes.
+    /// The writing side is this host.
     Here,
     /// The peer, which reads.
     NotAskedByPeer,
