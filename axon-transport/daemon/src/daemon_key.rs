@@ -18,12 +18,12 @@ const SIGNED: &[u8] = b"axon daemon proof 1";
 pub struct DaemonKey(SessionKey);
 
 impl DaemonKey {
-    /// A fresh one; `None` where the system gives no random bytes or no memory.
+    /// Generates a key; `None` where the system gives no random bytes or no memory.
     pub fn generate() -> Option<Self> {
         SessionKey::generate().map(Self)
     }
 
-    /// The id of its daemon.
+    /// Returns the id of the key's daemon.
     pub fn id(&self) -> DaemonId {
         id_of(self.0.public())
     }
@@ -42,7 +42,7 @@ impl From<SessionKey> for DaemonKey {
     }
 }
 
-/// The id of the daemon that has this public key.
+/// Returns the id of the daemon that has this public key.
 fn id_of(public: &[u8; 32]) -> DaemonId {
     let hash = Sha256::new().chain_update(ID).chain_update(public).finalize();
     let mut id = [0; 16];

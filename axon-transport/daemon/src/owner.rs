@@ -32,7 +32,7 @@ fn signed(binding: &ChannelBinding, from: DaemonId, id: &SessionId) -> Vec<u8> {
     [SIGNED, binding, &from.0, &id.0].concat()
 }
 
-/// The GIDs of a session begin with this.
+/// Returns the first bytes of a session's GIDs.
 pub fn prefix(id: &SessionId) -> SessionPrefix {
     prefix_of(&Gid(id.0))
 }
@@ -57,13 +57,13 @@ pub struct Proof {
 }
 
 impl Proof {
-    /// The session that it is for. Nothing is checked.
+    /// Returns the session of the proof, without a check.
     pub fn claims(&self) -> SessionId {
         session_id(&self.key)
     }
 
-    /// The session that the daemon `from` proves to have on the connection that `binding` is of; `None`
-    /// when the signature is not right.
+    /// Returns the session that the daemon `from` proves to have on the connection of `binding`; `None` if the
+    /// signature is wrong.
     pub fn session(&self, binding: &ChannelBinding, from: DaemonId) -> Option<SessionId> {
         let id = self.claims();
         let key = VerifyingKey::from_bytes(&self.key).ok()?;
@@ -108,7 +108,7 @@ mod tests {
     const ORDER: [u64; 4] =
         [0x5812_631a_5cf5_d3ed, 0x14de_f9de_a2f7_9cd6, 0, 0x1000_0000_0000_0000];
 
-    /// A number modulo the group's order, least significant byte first.
+    /// Returns a number modulo the group's order, least significant byte first.
     fn reduced(number: &[u8]) -> Vec<u8> {
         let mut rest = [0_u64; 4];
         for bit in (0..number.len() * 8).rev() {
@@ -128,8 +128,8 @@ mod tests {
         rest.iter().flat_map(|word| word.to_le_bytes()).collect()
     }
 
-    /// The secrets of a signature (RFC 8032, 5.1.6): the seed, its hash, the scalar, and the nonce
-    /// for `message`.
+    /// Returns the secrets of a signature (RFC 8032, 5.1.6): the seed, its hash, the scalar, and the nonce for
+    /// `message`.
     fn secrets(seed: &[u8; 32], message: &[u8]) -> Vec<Vec<u8>> {
         let hash = Sha512::digest(seed);
         let mut scalar = hash[..32].to_vec();

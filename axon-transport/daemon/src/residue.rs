@@ -45,7 +45,7 @@ fn below<T>(work: impl FnOnce() -> T) -> T {
 
 #[test]
 fn a_secret_left_on_the_stack_is_found() {
-    /// The secret is computed from a seed, so that it is stored nowhere.
+    /// Computes the secret from a seed, so that it is stored nowhere.
     fn secret() -> [u8; 32] {
         std::array::from_fn(|at| black_box(at as u8).wrapping_mul(151) ^ 0x5e)
     }

@@ -13,7 +13,7 @@ pub(crate) struct TokenBucket {
 }
 
 impl TokenBucket {
-    /// A full bucket.
+    /// Creates a full bucket.
     pub(crate) fn new(burst: u32, per_second: u32) -> Self {
         let burst = f64::from(burst);
         Self { burst, per_second: f64::from(per_second), tokens: burst, filled: Duration::ZERO }
@@ -28,7 +28,7 @@ impl TokenBucket {
         granted
     }
 
-    /// The time until there is a token.
+    /// Returns the time until there is a token.
     pub(crate) fn wait(&mut self, now: Duration) -> Duration {
         self.fill(now);
         self.until(1.0)
@@ -42,7 +42,7 @@ impl TokenBucket {
         self.until(0.0)
     }
 
-    /// Whether the bucket is full, as a new one is.
+    /// Returns whether the bucket is full.
     pub(crate) fn is_full(&mut self, now: Duration) -> bool {
         self.fill(now);
         self.tokens >= self.burst

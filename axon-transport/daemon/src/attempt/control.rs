@@ -105,7 +105,7 @@ impl Default for ReceivedBytes {
 }
 
 impl ReceivedBytes {
-    /// The next message of a known type, if it is complete.
+    /// Takes the next message of a known type, if it is complete.
     fn take(&mut self) -> Result<Option<LinkMessage>, FrameError> {
         while let Some(prefix) = self.bytes.first_chunk::<4>() {
             let end = 4 + read_length(*prefix, self.limits.frame)?;

@@ -101,22 +101,22 @@ impl AttemptDialler {
         })
     }
 
-    /// The settings.
+    /// Returns the settings.
     pub(super) fn config(&self) -> &Config {
         &self.config
     }
 
-    /// The daemon that this side poses as.
+    /// Returns the daemon that this side poses as.
     pub(super) fn daemon(&self) -> DaemonId {
         self.hello.daemon
     }
 
-    /// The time of the machines.
+    /// Returns the time of the machines.
     pub(super) fn now(&self) -> Duration {
         self.epoch.elapsed()
     }
 
-    /// The keyring, in qkd.
+    /// Returns the keyring, in qkd.
     pub(super) fn keyring(&mut self) -> Option<&mut Keyring> {
         self.keys.as_mut().map(|keys| &mut keys.keyring)
     }
@@ -196,7 +196,7 @@ impl AttemptDialler {
         }
     }
 
-    /// A PSK that the target must refuse.
+    /// Makes a PSK that the target must refuse.
     async fn forge(&mut self, bootstrap: Bootstrap) -> Result<DialKey, Refusal> {
         let now = self.now();
         let (Security::Qkd(qkd), Some(keys), Some(peer)) =
@@ -371,7 +371,8 @@ pub(super) fn close(connection: &Connection, code: CloseCode, reason: &str) {
     connection.close(VarInt::from_u32(code.code()), close_text(reason));
 }
 
-/// An endpoint on a port of the domain that reaches `target`, if one of the addresses to bind does.
+/// Binds an endpoint to a port of the domain, on the first configured address that reaches `target`. `None` if no
+/// address does.
 fn bind(config: &Config, target: SocketAddr) -> Result<Option<quinn::Endpoint>, EndpointError> {
     let (_, sockets) = bind_daemon(config)?;
     let socket = sockets.into_iter().find(|(address, _)| reaches(*address, target));

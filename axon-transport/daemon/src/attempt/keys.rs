@@ -22,10 +22,10 @@ pub(super) struct Keys {
 }
 
 impl Keys {
-    /// The keys of an attempt with these settings, `None` in classic. Must run within a tokio runtime.
+    /// Starts the keys of an attempt with these settings; `None` in classic. Must run within a tokio runtime.
     ///
     /// # Errors
-    /// The settings make no KME client.
+    /// The settings are not valid for a KME client.
     pub(super) fn start(config: &Config) -> Result<Option<Self>, KmeError> {
         let (Security::Qkd(qkd), Some(keyring)) = (&config.security, Keyring::new(config)) else {
             return Ok(None);
@@ -48,7 +48,7 @@ impl Keys {
         }
     }
 
-    /// The next answer. Cancel safe.
+    /// Waits for the next answer. Cancel safe.
     pub(super) async fn answer(&mut self) -> KmeAnswer {
         if let Some(event) = self.refused.pop_front() {
             return event;
@@ -60,10 +60,10 @@ impl Keys {
         }
     }
 
-    /// A fresh key for the peer `slave`, for a handshake that no machine knows of.
+    /// Fetches a fresh key for the peer `slave`, for a handshake that no state machine knows.
     ///
     /// # Errors
-    /// The KME gave none, and why.
+    /// The KME gave no key; the text says why.
     pub(super) async fn fetch(
         &mut self,
         now: Duration,

@@ -109,7 +109,7 @@ impl AcceptedLink {
         &self.opened.negotiated
     }
 
-    /// The peer's host name, as it calls itself.
+    /// Returns the host name that the peer states.
     pub fn host(&self) -> &str {
         &self.opened.hello.host
     }
@@ -190,7 +190,7 @@ impl AcceptedLink {
         messages.iter().try_for_each(|message| self.control.send(message)).map_err(internal)
     }
 
-    /// The daemon's subscription to `topic`.
+    /// Waits for the daemon's subscription to `topic`.
     async fn subscription(&mut self, topic: &str) -> Result<Subscribe, Refusal> {
         loop {
             match self.next().await {
@@ -203,7 +203,7 @@ impl AcceptedLink {
         }
     }
 
-    /// A sealed sample as it goes on a stream: length and envelope.
+    /// Returns a sealed sample in the form of a stream: length and envelope.
     async fn seal(
         &mut self,
         publisher: Gid,
@@ -264,7 +264,7 @@ impl AcceptedLink {
         }
     }
 
-    /// Why the daemon closed the link, whose control stream ended.
+    /// Returns the reason why the daemon closed the link, whose control stream ended.
     async fn closed(&self) -> Refusal {
         match tokio::time::timeout(REFUSAL_TIMEOUT, self.connection.closed()).await {
             Ok(error) => Refusal::of(&error),

@@ -305,7 +305,7 @@ mod tests {
         assert!(!seen.has_changed().unwrap());
     }
 
-    /// A daemon whose gateway has started and has not taken over the rules that were read.
+    /// Creates a daemon whose gateway has started and has not yet taken over the new rules.
     fn reloaded() -> Rc<RefCell<ControlPlane>> {
         let mut control = control(Config::default());
         control.gateway_says(ToControl::Started { port: 1 });

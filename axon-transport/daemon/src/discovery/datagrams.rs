@@ -27,7 +27,7 @@ impl Datagrams {
         self.all.is_empty()
     }
 
-    /// The sender and the content of each.
+    /// Returns the sender and the content of each datagram.
     pub fn iter(&self) -> impl Iterator<Item = (SocketAddr, &[u8])> {
         let begins = std::iter::once(0).chain(self.all.iter().map(|(_, end)| *end));
         self.all.iter().zip(begins).map(|((from, end), begin)| (*from, &self.bytes[begin..*end]))

@@ -32,7 +32,7 @@ pub(crate) struct Interface {
 }
 
 impl Interface {
-    /// Whether `address` is in this interface's subnet.
+    /// Returns whether `address` is in this interface's subnet.
     pub(crate) fn contains(&self, address: IpAddr) -> bool {
         let same = |ours: u128, theirs: u128, bits: u32| {
             let prefix = u32::from(self.prefix).min(bits);
@@ -56,7 +56,7 @@ impl Interface {
     }
 }
 
-/// The addresses of all interfaces that are up, in a stable order.
+/// Returns the addresses of all interfaces that are up, in a stable order.
 pub(crate) fn interfaces() -> io::Result<Vec<Interface>> {
     let mut found: Vec<Interface> = getifaddrs()?
         .filter(|entry| entry.flags.contains(InterfaceFlags::IFF_UP))

@@ -32,7 +32,7 @@ pub(crate) use peers::{Arrival, LocalDaemon, PeerDiscovery, PeersOutput};
 pub(crate) use run::{DiscoveryEvent, run};
 pub(crate) use wanted::DiscoveryNeeds;
 
-/// The UDP ports that daemons of `domain` take their QUIC port from, the first that is free.
+/// Returns the UDP ports of daemons of `domain`. A daemon takes the first free one as its QUIC port.
 ///
 /// ```
 /// assert_eq!(axon_daemon::internal::quic_ports(0), 61300..=61315);
@@ -43,7 +43,7 @@ pub fn quic_ports(domain: u32) -> RangeInclusive<u16> {
     first..=first + 15
 }
 
-/// The multicast group and port that all daemons of `domain` share.
+/// Returns the multicast group and port that all daemons of `domain` share.
 ///
 /// ```
 /// let group = axon_daemon::internal::shared_group(7);

@@ -91,7 +91,7 @@ impl SharedSocket {
         }
     }
 
-    /// The next datagram and where it came from, cut at one byte more than the longest good one.
+    /// Waits for the next datagram. Returns its sender and its content, cut at one byte more than the maximum length.
     pub(crate) async fn receive(&self) -> io::Result<(SocketAddr, Vec<u8>)> {
         let mut buffer = [0; LONGEST + 1];
         let (length, from) = self.receiver.recv_from(&mut buffer).await?;

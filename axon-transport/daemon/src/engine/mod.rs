@@ -102,10 +102,10 @@ pub(crate) struct Engine {
 }
 
 impl Engine {
-    /// An engine without peers.
+    /// Creates an engine without peers.
     ///
     /// # Errors
-    /// The settings make no TLS server.
+    /// The settings are not valid for a TLS server.
     pub(crate) fn new(parts: EngineParts) -> Result<Self, GatewayError> {
         let EngineParts { links, rings, session_keys, session, epoch_nanos } = parts;
         let (config, daemon) = (Arc::clone(&links.config), links.hello.daemon);
@@ -174,34 +174,34 @@ impl Engine {
         }
     }
 
-    /// The graph of this host changed.
+    /// Handles a change of this host's graph.
     pub(crate) fn handle_local_graph(&mut self, now: Duration, local: LocalEndpoints) {
         self.peers.handle_local_graph(now, local);
         self.effects.tell_draining(self.peers.are_draining());
     }
 
-    /// When [`handle_local_graph`](Self::handle_local_graph) should be called next: thousands of endpoints that come one
-    /// after the other are followed together.
+    /// Returns when [`handle_local_graph`](Self::handle_local_graph) should be called next. The delay lets thousands of
+    /// endpoints that come one after the other be handled together.
     pub(crate) fn follow_local_at(&self) -> Duration {
         self.peers.follow_local_at()
     }
 
-    /// Samples wait in rings, or readers made room in them.
+    /// Handles the rings: samples wait in them, or readers made room.
     pub(crate) fn handle_rings(&mut self, now: Duration) {
         self.peers.handle_rings(now);
     }
 
-    /// The KME answered.
+    /// Handles an answer of the KME.
     pub(crate) fn handle_key_event(&mut self, now: Duration, event: keys::KmeAnswer) {
         self.links.handle_key_event(now, event);
     }
 
-    /// The ledger of used keys recorded the key of a connection; `first` if it was new.
+    /// Handles the ledger's record of a connection's key; `first` if the key was new.
     pub(crate) fn handle_recorded(&mut self, now: Duration, link: u64, first: bool) {
         self.links.handle_recorded(now, link, first);
     }
 
-    /// A sample was compressed, or does not become shorter.
+    /// Handles the compressor's answer: a sample was compressed, or does not become shorter.
     pub(crate) fn handle_compressed(&mut self, now: Duration, answer: CompressionAnswer) {
         for asker in self.factory.compression().handle_answer(now, &answer) {
             if let Some(peer) = self.peers.get_mut(asker.daemon) {
@@ -216,7 +216,7 @@ impl Engine {
         self.links.set_interfaces(interfaces);
     }
 
-    /// The files of the identity changed.
+    /// Handles a change of the identity's files.
     pub(crate) fn handle_identity(&mut self, now: Duration) {
         self.links.close_untrusted(true, now);
     }
@@ -312,7 +312,7 @@ impl Engine {
         }
     }
 
-    /// A peer that was silent is back.
+    /// Handles the return of a silent peer.
     fn back(&mut self, daemon: DaemonId, now: Duration) {
         let Some(peer) = self.peers.get_mut(daemon) else { return };
         if std::mem::take(&mut peer.silent) {
@@ -323,7 +323,7 @@ impl Engine {
         }
     }
 
-    /// A link of a peer is elected, the first or a successor.
+    /// Handles the election of a peer's link, the first or a successor.
     fn link_up(&mut self, number: u64, daemon: DaemonId, old: Option<u64>, now: Duration) {
         let Some(link) = self.links.view(number) else { return };
         let binding = link.binding();
@@ -481,7 +481,7 @@ impl Engine {
         }
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) is due.
+    /// Returns when [`handle_timeout`](Self::handle_timeout) is due.
     pub(crate) fn poll_timeout(&self, now: Duration) -> Option<Duration> {
         let report = (!self.peers.is_empty()).then(|| self.reports.poll_timeout());
         // This covers the results of the last packets of a pass.
@@ -511,7 +511,7 @@ impl Engine {
         }
     }
 
-    /// The next packets: the endpoint that sends them, and how. `buffer` has their bytes.
+    /// Returns the next packets: the number of the endpoint that sends them, and how. `buffer` has their bytes.
     pub(crate) fn poll_transmit(
         &mut self,
         max_datagrams: usize,
@@ -521,17 +521,18 @@ impl Engine {
         self.links.poll_transmit(max_datagrams, buffer, now)
     }
 
-    /// The next effect.
+    /// Returns the next effect.
     pub(crate) fn poll_effect(&mut self) -> Option<Effect> {
         self.effects.poll()
     }
 
-    /// Samples that wait for peers, in bytes, and how many bytes have left the queues since the start.
+    /// Returns the bytes of the samples that wait for peers, and the number of bytes that have left the queues since
+    /// the start.
     pub(crate) fn backlog(&self) -> (usize, usize) {
         self.factory.backlog()
     }
 
-    /// The keys for status, with counters of the KME and the ledger.
+    /// Returns the keys for status, with counters of the KME and the ledger.
     pub(crate) fn key_status(
         &self,
         kme: &keys::Statistics,

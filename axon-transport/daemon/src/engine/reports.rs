@@ -15,17 +15,17 @@ pub(super) struct Reports {
 }
 
 impl Reports {
-    /// The first report is due a second after the engine's start.
+    /// Creates the schedule: the first report is due a second after the engine's start.
     pub(super) fn new() -> Self {
         Self { next: REPORT_INTERVAL }
     }
 
-    /// A link changed: the next report is due now.
+    /// Makes the next report due now, because a link changed.
     pub(super) fn hurry(&mut self, now: Duration) {
         self.next = now;
     }
 
-    /// When the next report is due, while there are peers.
+    /// Returns when the next report is due, while there are peers.
     pub(super) fn poll_timeout(&self) -> Duration {
         self.next
     }
@@ -55,7 +55,7 @@ pub(super) fn report(peers: &mut LinkedPeers, links: &Links, effects: &mut Effec
     }
 }
 
-/// Names the peers that have more long messages in flight than they may: their links may stand still.
+/// Reports the peers that have more long messages in flight than they may: their links may stand still.
 fn report_excess(peers: &mut LinkedPeers, links: &Links, effects: &mut Effects) {
     for peer in peers.values_mut() {
         let Some(most) = links.window_credit(peer.link) else { continue };

@@ -46,7 +46,7 @@ pub(crate) trait Rings {
 
 /// A relay subscription: it reads the rings of all local publishers of a topic.
 pub(crate) trait RingReader {
-    /// The relay's own GID.
+    /// Returns the relay's own GID.
     fn gid(&self) -> Gid;
     /// Returns the publishers that have samples to take.
     fn with_data(&self) -> Vec<Gid>;
@@ -114,7 +114,7 @@ pub(crate) enum RingError {
 /// A stand-in for a remote publisher, client or server. The stand-in of a client or server also reads the
 /// responses or requests for its endpoint.
 pub(crate) trait RingWriter {
-    /// The remote endpoint.
+    /// Returns the remote endpoint.
     fn endpoint(&self) -> &Endpoint;
     /// Returns the local endpoints that the stand-in reaches.
     fn partners(&self) -> Vec<Gid>;

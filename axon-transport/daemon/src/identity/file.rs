@@ -18,10 +18,10 @@ pub(super) struct NamedFile {
 }
 
 impl NamedFile {
-    /// The file at `path`, if the setting is given.
+    /// Names the file at `path`, if the setting is given.
     ///
     /// # Errors
-    /// It is not.
+    /// The setting is missing.
     pub(super) fn new(variable: &'static str, path: Option<&Path>) -> Result<Self, GatewayError> {
         let path = path.ok_or(GatewayError::Missing(variable))?.to_owned();
         let demands = match variable {
@@ -32,7 +32,7 @@ impl NamedFile {
         Ok(Self { variable, path, demands })
     }
 
-    /// The failure of this file.
+    /// Returns the failure of this file.
     pub(super) fn unusable(&self, reason: impl std::fmt::Display) -> GatewayError {
         GatewayError::File {
             variable: self.variable,

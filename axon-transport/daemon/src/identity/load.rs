@@ -23,10 +23,10 @@ enum Kind {
 }
 
 impl IdentityFiles {
-    /// Which files there are.
+    /// Returns the files that the settings name.
     ///
     /// # Errors
-    /// A setting that is missing.
+    /// A setting is missing.
     pub(super) fn of(classic: &ClassicConfig) -> Result<Self, GatewayError> {
         let ClassicConfig { key, trust, ca, cert, crl, .. } = classic;
         let kind = match classic.auth {
@@ -48,7 +48,7 @@ impl IdentityFiles {
         Ok(Self { kind })
     }
 
-    /// Each of them.
+    /// Returns all files.
     pub(super) fn files(&self) -> Vec<NamedFile> {
         match &self.kind {
             Kind::None => Vec::new(),
@@ -169,7 +169,7 @@ pub(super) struct Loaded {
 }
 
 impl Loaded {
-    /// For a look at it. Its pins are not in force.
+    /// Returns the identity for inspection. Its pins are not in force.
     pub(super) fn auth(&self) -> &Auth {
         &self.auth
     }

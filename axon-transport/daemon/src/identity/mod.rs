@@ -127,7 +127,7 @@ impl Identity {
     }
 }
 
-/// The classic identity that the settings name.
+/// Loads the classic identity that the settings name.
 ///
 /// # Errors
 /// A file of it cannot be used.
@@ -143,7 +143,7 @@ pub(crate) fn load(classic: &ClassicConfig, node: &str) -> Result<Identity, Gate
     })
 }
 
-/// A lock whose holder does not panic in a state that matters.
+/// Locks a mutex, even if a thread panicked while it held the lock: no panic leaves an inconsistent state.
 fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -17,7 +17,7 @@ pub struct Clock(
 );
 
 impl Clock {
-    /// The time.
+    /// Returns the time.
     pub fn now(&self) -> Duration {
         Duration::from_nanos(self.0.load(Ordering::Relaxed))
     }

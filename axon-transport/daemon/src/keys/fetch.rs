@@ -105,14 +105,14 @@ impl Fetches {
         }
     }
 
-    /// When [`poll_request`](Self::poll_request) gives something without an answer before.
+    /// Returns when [`poll_request`](Self::poll_request) gives a request even if no answer comes before.
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
         let free = self.in_flight.len() < IN_FLIGHT;
         let due = free.then(|| self.waiting.iter().map(|b| b.not_before).min()).flatten();
         due.map(|due| due.max(self.refusals_allow()))
     }
 
-    /// When another call may be refused.
+    /// Returns when another call may be refused.
     fn refusals_allow(&self) -> Duration {
         let (left, at) = self.refusals;
         at + Duration::from_secs_f64((1.0 - left).max(0.0) / REFUSALS_PER_SECOND)

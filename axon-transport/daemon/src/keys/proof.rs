@@ -9,8 +9,8 @@ use zeroize::Zeroizing;
 
 use crate::wire::keys::PROOF_LEN as LEN;
 
-/// `HMAC-SHA256(HKDF-SHA256(no salt, key, "axon ready"), key_ID || ready)`; `ready` is the
-/// connection's TLS exporter [`READY_EXPORTER`](super::READY_EXPORTER).
+/// Returns `HMAC-SHA256(HKDF-SHA256(no salt, key, "axon ready"), key_ID || ready)`; `ready` is the connection's TLS
+/// exporter [`READY_EXPORTER`](super::READY_EXPORTER).
 pub fn compute(key: &KmeKey, key_id: &KeyId, ready: &[u8; 32]) -> [u8; LEN] {
     key.derive(|key| mac(key, key_id, ready).finalize().into_bytes().into())
 }

@@ -102,7 +102,7 @@ pub enum FailureKind {
 }
 
 impl RequestFailure {
-    /// One after which the KME asked for no pause.
+    /// Makes a failure after which the KME asked for no pause.
     pub fn new(kind: FailureKind, text: impl Into<String>) -> Self {
         Self { kind, text: text.into(), retry_after: None }
     }

@@ -47,7 +47,7 @@ pub struct UsedStatistics {
 }
 
 impl UsedKeys {
-    /// For a tool that makes a few links and ends.
+    /// Creates a record in memory, for a tool that makes a few links and ends.
     pub fn in_memory() -> Self {
         Self::with(None)
     }
@@ -156,7 +156,7 @@ impl Used {
         self.trouble = Some(why);
     }
 
-    /// The log line for a record that cannot be kept, with its remedy.
+    /// Returns the log line for a record that cannot be kept, with its remedy.
     fn complaint(&self, why: &str) -> String {
         let remedy = match self.path {
             Some(_) => "Repair it, or move the file away",

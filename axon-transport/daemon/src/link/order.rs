@@ -47,18 +47,18 @@ pub struct MessageOrder {
 }
 
 impl MessageOrder {
-    /// The order for a fresh connection, in qkd or classic.
+    /// Returns the order for a fresh connection, in qkd or classic.
     pub fn new(side: Side, qkd: bool) -> Self {
         Self { side, qkd, peer_elects: false, step: OrderStep::Hello, hello_seen: false }
     }
 
-    /// The peer's HELLO was checked; `peer_elects` when its daemon id is the lower one.
+    /// Records that the peer's HELLO was checked; `peer_elects` if the peer's daemon id is the lower one.
     pub fn hello_checked(&mut self, peer_elects: bool) {
         self.peer_elects = peer_elects;
         self.step = if self.qkd { OrderStep::Proof } else { OrderStep::Election };
     }
 
-    /// Server: READY with the right proof came. Client: it sent READY.
+    /// Records the proof. Server: READY with the right proof came. Client: it sent READY.
     pub fn proven(&mut self) {
         if self.step == OrderStep::Proof {
             self.step = OrderStep::Election;
@@ -130,7 +130,7 @@ impl MessageOrder {
 }
 
 impl LinkMessage {
-    /// The message's name in `docs/formats.md`.
+    /// Returns the message's name in `docs/formats.md`.
     pub fn name(&self) -> &'static str {
         match self {
             Self::Hello(_) => "HELLO",

@@ -57,8 +57,8 @@ fn bind_one(address: SocketAddr) -> io::Result<(SocketAddr, UdpSocket)> {
     Ok((address, socket))
 }
 
-/// The key of stateless resets: kept in the runtime directory, so that the daemon that takes over after a kill can at
-/// once tell the peers of its predecessor that their links are gone.
+/// Returns the key of stateless resets. It is kept in the runtime directory, so that the daemon that takes over after a
+/// kill can at once tell the peers of its predecessor that their links are gone.
 pub(crate) fn reset_key(runtime_dir: Option<&Path>, domain: u32) -> [u8; 32] {
     use std::{fs, io::Write, os::unix::fs::OpenOptionsExt};
 

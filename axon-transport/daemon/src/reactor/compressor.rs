@@ -18,7 +18,7 @@ pub(super) struct CompressorThread {
 }
 
 impl CompressorThread {
-    /// A thread that has not begun. Its answers go to `report`.
+    /// Creates a compressor whose thread has not started. Its answers go to `report`.
     pub(super) fn new(report: mpsc::UnboundedSender<TaskResult>) -> Self {
         Self { orders: None, report }
     }

@@ -13,7 +13,7 @@ pub(super) struct ControlOutbox {
 }
 
 impl ControlOutbox {
-    /// An empty outbox.
+    /// Creates an empty outbox.
     pub(super) fn new(control: Sender<ToControl>) -> Self {
         Self { control, waiting: VecDeque::new() }
     }

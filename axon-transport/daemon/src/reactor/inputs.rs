@@ -81,7 +81,7 @@ impl Inputs {
         std::mem::take(&mut self.rang)
     }
 
-    /// The inputs that are there, up to a bound.
+    /// Takes the waiting inputs, up to a bound.
     pub(super) fn take(&mut self) -> Vec<ReactorInput> {
         let mut inputs = std::mem::take(&mut self.taken);
         for _ in 0..BATCH {
@@ -104,7 +104,7 @@ impl Inputs {
         inputs
     }
 
-    /// Ready once there is an input.
+    /// Polls for an input: ready once there is one.
     pub(super) fn poll_ready(&mut self, cx: &mut Context<'_>) -> Poll<()> {
         if let Poll::Ready(ready) = self.doorbell.poll_read_ready(cx) {
             self.rang = true;

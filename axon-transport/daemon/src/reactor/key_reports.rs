@@ -13,7 +13,7 @@ pub(super) struct KeyReports {
 }
 
 impl KeyReports {
-    /// When [`begin`](Self::begin) is due; not before the last report came.
+    /// Returns when [`begin`](Self::begin) is due; `None` until the last report has come.
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
         (!self.is_asked).then_some(self.next)
     }
@@ -27,7 +27,7 @@ impl KeyReports {
         due
     }
 
-    /// The report came.
+    /// Records that the report came.
     pub(super) fn handle_report(&mut self) {
         self.is_asked = false;
     }

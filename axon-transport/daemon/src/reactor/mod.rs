@@ -139,7 +139,7 @@ async fn serve(
     result
 }
 
-/// The files of QUIC's events. A daemon does without them rather than not start.
+/// Opens the files for QUIC's events. If that fails, the daemon starts without them.
 fn start_qlog(directory: &Path, daemon: DaemonId) -> Option<(QlogFiles, LastWrites)> {
     let started = QlogFiles::start(directory, daemon);
     started

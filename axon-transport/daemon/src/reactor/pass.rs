@@ -98,7 +98,7 @@ pub(super) struct Reactor {
 }
 
 impl Reactor {
-    /// A reactor that has not begun. Needs a tokio runtime.
+    /// Creates a reactor, which does not run yet. Needs a tokio runtime.
     ///
     /// # Errors
     /// The doorbell cannot be watched.

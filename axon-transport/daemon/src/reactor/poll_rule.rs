@@ -65,7 +65,7 @@ impl PollRule {
         }
     }
 
-    /// A look ended.
+    /// Records the result of a look.
     pub(super) fn handle_look(&mut self, found: bool) {
         self.made += 1;
         self.found += u32::from(found);

@@ -30,7 +30,7 @@ pub(super) struct ShmRings {
 }
 
 impl ShmRings {
-    /// The rings of `session`.
+    /// Opens the rings of `session`.
     ///
     /// # Errors
     /// The session's doorbell is taken.
@@ -45,7 +45,7 @@ impl ShmRings {
         }))
     }
 
-    /// The doorbell. It is readable once after each [`arm`](Self::arm).
+    /// Returns the doorbell. It is readable once after each [`arm`](Self::arm).
     pub(super) fn doorbell(&self) -> &ExternalLeader {
         &self.doorbell
     }

@@ -74,7 +74,7 @@ pub(super) fn open(
     Ok((session, notices))
 }
 
-/// The endpoints of applications on this host whose discovery range is known.
+/// Returns the endpoints of applications on this host whose discovery range is known.
 pub(super) fn local_graph(session: &Session) -> LocalEndpoints {
     let view = session.graph();
     let local = view.endpoints.values().filter(|e| e.daemon.is_none());

@@ -21,12 +21,12 @@ pub(super) struct ShutdownDrain {
 }
 
 impl ShutdownDrain {
-    /// A shutdown that begins now.
+    /// Creates a shutdown that begins now.
     pub(super) fn new(now: Duration) -> Self {
         Self { begun: now, released: 0, since: now, next: now + CHECK_INTERVAL, empty: false }
     }
 
-    /// When to [look](Self::is_over) again.
+    /// Returns when to [look](Self::is_over) again.
     pub(super) fn poll_timeout(&self) -> Duration {
         self.next
     }

@@ -70,12 +70,12 @@ impl Sockets {
         })
     }
 
-    /// The port.
+    /// Returns the port.
     pub(super) fn port(&self) -> u16 {
         self.port
     }
 
-    /// The bound addresses, in the order of the sockets.
+    /// Returns the bound addresses, in the order of the sockets.
     pub(super) fn addresses(&self) -> Vec<SocketAddr> {
         self.all.iter().map(|socket| socket.address).collect()
     }
@@ -135,7 +135,7 @@ impl Sockets {
         self.held.is_none()
     }
 
-    /// Ready once a socket can be read, or written to if packets were kept.
+    /// Polls the sockets: ready once one can be read, or written to if packets were kept.
     pub(super) fn poll_ready(&self, cx: &mut Context<'_>) -> Poll<()> {
         let mut ready = Poll::Pending;
         for socket in &self.all {

@@ -22,7 +22,7 @@ const TIMERFD_THRESHOLD: Duration = Duration::from_millis(100);
 pub(super) struct Timer(Option<AsyncFd<PassedFd>>);
 
 impl Timer {
-    /// A timer of the kernel. Needs a tokio runtime.
+    /// Creates a timer of the kernel. Needs a tokio runtime.
     pub(super) fn new() -> Self {
         let timer = create().and_then(watch);
         if let Err(error) = &timer {

@@ -236,7 +236,7 @@ impl Datagram {
         }
     }
 
-    /// The bytes of this datagram, at most [`LONGEST`] of them.
+    /// Returns the bytes of this datagram, at most [`LONGEST`] of them.
     pub fn encode(&self) -> Vec<u8> {
         let (kind, wire) = match self {
             Self::Beacon(beacon) => (1, beacon.to_wire()),

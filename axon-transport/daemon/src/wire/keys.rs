@@ -89,7 +89,7 @@ pub enum KeyViolation {
 }
 
 impl KeyViolation {
-    /// The application error code to close the connection with (docs/formats.md, section 6).
+    /// Returns the application error code to close the connection with (docs/formats.md, section 6).
     pub fn code(&self) -> u64 {
         match self {
             Self::Masks(..) => 0x30,
@@ -99,7 +99,7 @@ impl KeyViolation {
 }
 
 impl KeyMessage {
-    /// The frame's type byte.
+    /// Returns the frame's type byte.
     pub fn frame_type(&self) -> u8 {
         match self {
             Self::Announce(_) => ANNOUNCE,
@@ -109,7 +109,7 @@ impl KeyMessage {
         }
     }
 
-    /// The message's name in the format.
+    /// Returns the message's name in the format.
     pub fn name(&self) -> &'static str {
         match self {
             Self::Announce(_) => "ANNOUNCE",
@@ -219,7 +219,7 @@ struct Fields {
     reliable: Option<IndexMask>,
 }
 
-/// A key_ID's text, if it can be announced at all: text of at most [`MAX_KEY_ID`] bytes.
+/// Returns a key_ID's text, if the key_ID can be announced: text of at most [`MAX_KEY_ID`] bytes.
 pub(crate) fn announceable(key_id: &KeyId) -> Option<&str> {
     let fits = key_id.as_bytes().len() <= MAX_KEY_ID;
     std::str::from_utf8(key_id.as_bytes()).ok().filter(|_| fits)

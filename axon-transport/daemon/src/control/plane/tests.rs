@@ -20,7 +20,7 @@ fn control() -> ControlPlane {
     ControlPlane::new(Arc::new(Config::default()), Vec::new(), SpareDescriptors::default())
 }
 
-/// A link over which a route of topic /t does not cross.
+/// Adds a link over which a route of topic /t does not cross.
 fn link(control: &mut ControlPlane) {
     let mut status = LinkStatus::default();
     status.peer = DAEMON.to_string();
@@ -64,7 +64,8 @@ fn ended_gateway_clears_refused_routes() {
 
 const RULES: &str = "[[allow]]\npeer = \"uid:7\"\npublish = \"/x\"";
 
-/// A daemon with access rules, or without, and a session of another user, and one of its own, with an endpoint each.
+/// Creates a control plane with the given access rules, which may be empty. It has a session of another user and one of
+/// its own user, each with an endpoint.
 fn with_users(rules: &str) -> ControlPlane {
     let mut config = Config::default();
     if !rules.is_empty() {
@@ -96,7 +97,7 @@ fn connect(control: &mut ControlPlane, session: SessionId, shares_memory: bool) 
     control.registry.handle_connect(session, role, name, 1, descriptors, None).unwrap();
 }
 
-/// The report that a session is given next.
+/// Returns the next report for a session.
 fn report(control: &mut ControlPlane, session: SessionId) -> Value {
     let mut text = Vec::new();
     while let Some(output) = control.registry.poll_output(&session) {

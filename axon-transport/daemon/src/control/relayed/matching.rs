@@ -237,7 +237,7 @@ impl RelayedSession {
     }
 }
 
-/// The samples that a subscription requests from before its creation.
+/// Returns the number of samples that a subscription requests from before its creation.
 fn history_of(qos: &Qos) -> Option<u32> {
     let depth = if qos.history == History::KeepAll { u32::MAX } else { qos.depth };
     (qos.durability == Durability::TransientLocal).then_some(depth)

@@ -392,7 +392,7 @@ impl Keyring {
         Ok(number)
     }
 
-    /// The number of the peer that the connection is attached to.
+    /// Returns the number of the peer that the connection is attached to.
     fn attached(&self, connection: u64) -> Result<usize, SupplyError> {
         let number = self.connections.get(&connection).copied();
         number.ok_or(SupplyError::Unattached(connection))

@@ -17,7 +17,7 @@ pub(crate) fn s(secs: u64) -> Duration {
     Duration::from_secs(secs)
 }
 
-/// The settings of SAE `sae`, which links with every other SAE.
+/// Returns the settings of SAE `sae`, which links with every other SAE.
 pub(crate) fn config(sae: &str, key_mode: KeyMode) -> Config {
     let mut config = Config::default();
     let kme = format!("https://kme-of-{sae}");
@@ -105,7 +105,7 @@ impl Pair {
         Self { now: s(1), kmes: Kmes::default(), rings, said: Vec::new() }
     }
 
-    /// Both ends open connection `number` and elect it.
+    /// Opens connection `number` at both ends and elects it.
     fn connect(&mut self, number: u8) {
         for (at, peer) in [(0, "sae-b"), (1, "sae-a")] {
             let (ring, connection) = (&mut self.rings[at], u64::from(number));
@@ -387,8 +387,9 @@ fn classic_has_no_keyring() {
     assert!(Keyring::new(&Config::default()).is_none());
 }
 
-/// Two keyrings between which a message goes every 20 ms. All calls of one of them that begin within five seconds are
-/// given up after the answer limit. Returns the longest time without a message, and how many calls that were.
+/// Sends a message between two keyrings every 20 ms. All calls of the keyring `hangs` that begin within five seconds of
+/// `begin` are given up after the answer limit. Returns the longest time without a message, and the number of these
+/// calls.
 fn longest_pause(hangs: usize, begin: Duration) -> (Duration, usize) {
     const ANSWER_LIMIT: Duration = Duration::from_secs(3);
     let mut pair = Pair::new();

@@ -36,7 +36,7 @@ impl InterfaceLimits {
         self.renew();
     }
 
-    /// A connection has another local address: the interfaces may have changed.
+    /// Handles a new local address of a connection: the interfaces may have changed.
     pub(crate) fn handle_address(&mut self) {
         self.is_wanted = !self.rules.is_empty();
     }

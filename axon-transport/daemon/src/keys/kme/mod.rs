@@ -183,7 +183,7 @@ impl Kme {
 }
 
 impl Events {
-    /// The next answer; `None` when the last [`Kme`] is dropped and all is answered. Cancel safe.
+    /// Waits for the next answer; `None` when the last [`Kme`] is dropped and all requests are answered. Cancel safe.
     pub async fn recv(&mut self) -> Option<KmeAnswer> {
         self.0.recv().await
     }
@@ -196,7 +196,7 @@ impl Events {
         self.0.poll_recv(cx)
     }
 
-    /// The next answer, if there is one now.
+    /// Returns the next answer, if there is one now.
     pub fn try_recv(&mut self) -> Option<KmeAnswer> {
         self.0.try_recv().ok()
     }
@@ -236,7 +236,7 @@ async fn serve(
     while running.join_next().await.is_some() {}
 }
 
-/// The next job; meanwhile finished calls are cleared away.
+/// Waits for the next job; meanwhile removes finished calls.
 async fn next(
     jobs: &mut mpsc::Receiver<Job>,
     running: &mut JoinSet<()>,
@@ -286,7 +286,7 @@ fn read(
     demands.read(path).map_err(failure)
 }
 
-/// Names the variable behind the client's setting.
+/// Returns the error that names the variable behind the client's setting.
 fn setting(config: &QkdConfig, e: etsi_qkd014::Error) -> KmeError {
     let (setting, reason) = match e {
         etsi_qkd014::Error::Config { setting, reason } => (setting, reason),

@@ -52,7 +52,7 @@ pub struct CallStatistics {
 }
 
 impl Statistics {
-    /// Keys fetched for any purpose.
+    /// Returns the number of keys fetched for any purpose.
     pub fn keys(&self) -> u64 {
         self.keys_bootstrap + self.keys_accept + self.keys_proof + self.keys_messages
     }

@@ -20,7 +20,7 @@ async fn network() -> Network {
     builder.start().await.unwrap()
 }
 
-/// The settings of `sae`, with its files under `dir`.
+/// Returns the settings of `sae`, with its files under `dir`.
 fn config(network: &Network, sae: &str, dir: &Path) -> QkdConfig {
     network.write_files(dir).unwrap();
     let env: std::collections::HashMap<_, _> =

@@ -88,7 +88,7 @@ pub enum ProofFailure {
 }
 
 impl ProofFailure {
-    /// The application error code to close the connection with (docs/formats.md, section 6).
+    /// Returns the application error code to close the connection with (docs/formats.md, section 6).
     pub fn code(&self) -> u64 {
         match self {
             Self::NoKey { .. } | Self::ClientHasNoKey { .. } => 0x23,
@@ -110,7 +110,7 @@ impl ClientProof {
         }
     }
 
-    /// The next call to the KME, if any.
+    /// Returns the next call to the KME, if any.
     pub fn poll_request(&mut self, now: Duration) -> Option<KmeRequest> {
         match self.step {
             ProofStep::Ask { not_before } if not_before <= now => {}
@@ -125,7 +125,7 @@ impl ClientProof {
         })
     }
 
-    /// The KME's answer to our request.
+    /// Handles the KME's answer to our request.
     pub fn handle_answer(&mut self, now: Duration, answer: Answer) {
         if !matches!(self.step, ProofStep::Asked) {
             return;
@@ -150,7 +150,7 @@ impl ClientProof {
         };
     }
 
-    /// The ANNOUNCE, once.
+    /// Returns the ANNOUNCE, once.
     pub fn poll_message(&mut self) -> Option<KeyMessage> {
         match std::mem::replace(&mut self.step, ProofStep::Asked) {
             ProofStep::Announce(key_id, key) => {
@@ -192,7 +192,7 @@ impl ClientProof {
         self.step = ProofStep::Failed(failure);
     }
 
-    /// When to call [`handle_timeout`](Self::handle_timeout) and poll again without other cause.
+    /// Returns when to call [`handle_timeout`](Self::handle_timeout) and poll again without other cause.
     pub fn poll_timeout(&self) -> Option<Duration> {
         match &self.step {
             ProofStep::Proven(..) | ProofStep::Failed(_) => None,
@@ -219,8 +219,8 @@ impl ClientProof {
         }
     }
 
-    /// The key that proved it: in `messages10` the first sending key, for
-    /// [`KeySender::adopt`](crate::keys::KeySender::adopt); in `session` it is spent by being dropped.
+    /// Returns the key of the proof. In `messages10` it is the first sending key, for
+    /// [`KeySender::adopt`](crate::keys::KeySender::adopt). In `session` dropping it spends it.
     pub fn into_key(self) -> Option<(KeyId, KmeKey)> {
         match self.step {
             ProofStep::Proven(key_id, key) => Some((key_id, key)),

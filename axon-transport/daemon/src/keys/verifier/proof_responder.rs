@@ -51,12 +51,12 @@ impl ProofResponder {
         }
     }
 
-    /// The next call to the KME, if any.
+    /// Returns the next call to the KME, if any.
     pub fn poll_request(&mut self, now: Duration) -> Option<KmeRequest> {
         self.fetches.poll_request(now)
     }
 
-    /// The KME's answer to one of our requests. The key is used for the proof, and erased.
+    /// Handles the KME's answer to one of our requests. The key is used for the proof, and erased.
     pub fn handle_answer(&mut self, now: Duration, answer: Answer) {
         for (key_id, outcome) in self.fetches.handle_answer(now, answer) {
             let (message, answered) = match outcome {
@@ -74,12 +74,12 @@ impl ProofResponder {
         }
     }
 
-    /// READY or FAILED, once.
+    /// Returns READY or FAILED, once.
     pub fn poll_message(&mut self) -> Option<KeyMessage> {
         self.outbox.take()
     }
 
-    /// When to poll again without other cause.
+    /// Returns when to poll again without other cause.
     pub fn poll_timeout(&self) -> Option<Duration> {
         self.fetches.poll_timeout()
     }

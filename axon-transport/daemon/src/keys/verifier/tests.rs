@@ -33,7 +33,7 @@ fn failed(request: KmeRequest, kind: FailureKind) -> Answer {
     Answer { request, took: Duration::ZERO, outcome }
 }
 
-/// A server that has announced `k1`, whose key is all ones.
+/// Returns a server that has announced `k1`, whose key is all ones.
 fn announced() -> ClientProof {
     let mut proof = ClientProof::new(NOW, "sae-a", &exporters());
     let request = proof.poll_request(NOW).unwrap();

@@ -38,7 +38,7 @@ fn secs(now: Duration) -> u64 {
     now.as_secs()
 }
 
-/// A flow whose publisher fails to publish from the beginning on.
+/// Returns a flow whose publisher cannot publish from the start.
 fn held(now: Duration) -> BusyFlow {
     BusyFlow { refused: Some(10 * now.as_secs()), ..FLOW }
 }

@@ -279,7 +279,7 @@ mod tests {
             self.table.find_or_insert(1, gid(publisher), &self.budget).unwrap()
         }
 
-        /// The flow takes all samples from its ring, as a burst.
+        /// Makes the flow take all samples from its ring, as a burst.
         fn fill(&mut self, id: FlowId) {
             let (flow, served) = self.table.get_mut(id).unwrap();
             flow.handle_samples();

@@ -257,7 +257,7 @@ impl RefusedRoutes {
         unasked.chain(unserved).chain(theirs).chain(unwanted)
     }
 
-    /// Names the refused routes in the link's status.
+    /// Adds the refused routes to the link's status.
     pub(in crate::engine::peer) fn fill(&self, status: &mut LinkStatus) {
         let mut listed = BTreeSet::new();
         // Beyond the limit the status shows only the number.
