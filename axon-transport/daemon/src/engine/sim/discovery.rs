@@ -11,7 +11,7 @@ use axon_shm::ids::DaemonId;
 
 use crate::{bridge::ToGateway, discovery::AddressConfidence};
 
-/// The daemon of the higher id dials later by so much.
+/// Delay of the dial by the daemon of the higher id.
 const SECOND_DIAL: Duration = Duration::from_millis(300);
 /// Time between a failed dial, or the end of a link, and the next dial. The daemon of the higher id waits twice as long.
 const REDIAL: Duration = Duration::from_millis(250);
@@ -43,12 +43,12 @@ struct Peer {
 /// A link that stands.
 struct Linked {
     address: SocketAddr,
-    /// Its path does not work.
+    /// Whether the path of its link is cut.
     cut: bool,
 }
 
 impl SimDiscovery {
-    /// The host's daemon starts: it dials all peers.
+    /// Handles the start of the host's daemon: dials all peers.
     pub(super) fn start(&mut self, daemon: DaemonId, now: Duration) {
         self.daemon = daemon;
         self.links.clear();
@@ -56,17 +56,17 @@ impl SimDiscovery {
         self.peers.values_mut().for_each(|peer| peer.dial_at = Some(now));
     }
 
-    /// The host's daemon is dead.
+    /// Handles the death of the host's daemon.
     pub(super) fn kill(&mut self) {
         self.links.clear();
     }
 
-    /// The peers that are linked.
+    /// Returns the linked peers.
     pub(super) fn linked(&self) -> BTreeSet<DaemonId> {
         self.links.keys().copied().collect()
     }
 
-    /// A peer is to be linked with. The lower id dials first.
+    /// Adds a peer to link with. The lower id dials first.
     pub(super) fn want(
         &mut self,
         daemon: DaemonId,
@@ -91,7 +91,7 @@ impl SimDiscovery {
         self.addresses.insert(daemon, addresses);
     }
 
-    /// A peer has another address.
+    /// Sets a new address of a peer.
     pub(super) fn set_address(&mut self, daemon: DaemonId, address: SocketAddr) {
         let Some(peer) = self.peers.get_mut(&daemon) else { return };
         peer.address = address;
@@ -100,7 +100,7 @@ impl SimDiscovery {
         }
     }
 
-    /// A link stands there.
+    /// Records a link at this address.
     pub(super) fn handle_link_up(&mut self, daemon: DaemonId, address: SocketAddr) {
         self.links.insert(daemon, Linked { address, cut: false });
         if let Some(addresses) = self.addresses.get(&daemon).cloned() {
@@ -108,7 +108,7 @@ impl SimDiscovery {
         }
     }
 
-    /// The path of a link works, or does not.
+    /// Records whether the path of a link works.
     pub(super) fn handle_path(&mut self, now: Duration, daemon: DaemonId, works: bool) {
         let Some(link) = self.links.get_mut(&daemon) else { return };
         link.cut = !works;
@@ -117,13 +117,13 @@ impl SimDiscovery {
         }
     }
 
-    /// The link with a peer is no more.
+    /// Handles the end of the link with a peer.
     pub(super) fn handle_link_down(&mut self, now: Duration, daemon: DaemonId) {
         self.links.remove(&daemon);
         self.handle_dial_failed(now, daemon);
     }
 
-    /// A dial came to nothing.
+    /// Handles a failed dial.
     pub(super) fn handle_dial_failed(&mut self, now: Duration, daemon: DaemonId) {
         if let Some(peer) = self.peers.get_mut(&daemon) {
             let wait = if self.daemon < daemon { REDIAL } else { 2 * REDIAL };
@@ -131,13 +131,13 @@ impl SimDiscovery {
         }
     }
 
-    /// When a dial is due.
+    /// Returns when a dial is due.
     pub(super) fn poll_timeout(&self) -> Option<Duration> {
         let ordered = (!self.orders.is_empty()).then_some(Duration::ZERO);
         self.looked_for().filter_map(|(_, peer)| peer.dial_at).chain(ordered).min()
     }
 
-    /// The dials that are due, and other orders.
+    /// Takes the dials that are due, and other orders.
     pub(super) fn take_due(&mut self, now: Duration) -> Vec<ToGateway> {
         let due = self.looked_for().filter(|(_, peer)| peer.dial_at.is_some_and(|at| at <= now));
         let due: Vec<_> = due.map(|(daemon, _)| *daemon).collect();
@@ -153,14 +153,15 @@ impl SimDiscovery {
         self.orders.drain(..).chain(dials).collect()
     }
 
-    /// Dials that may be under way, those of successors included.
+    /// Returns the maximum number of dials that may be under way, including dials of successors.
     pub(super) fn most_dials(&mut self, now: Duration) -> usize {
         self.dialled.retain(|at| *at + LONGEST_DIAL >= now);
-        // A silent link dials a successor again after 1, 2, 4 and 8 s, whatever became of the one before.
+        // A silent link dials a successor again after 1, 2, 4 and 8 s, even if the dial before failed.
         self.dialled.len() + 5 * self.peers.len()
     }
 
-    /// Peers that are not linked, or elsewhere than at the end of a path that does not work.
+    /// Returns the peers without a link, and those whose link has a path that does not work and whose address is
+    /// another.
     fn looked_for(&self) -> impl Iterator<Item = (&DaemonId, &Peer)> {
         self.peers.iter().filter(|(daemon, peer)| match self.links.get(daemon) {
             Some(link) => link.cut && link.address != peer.address,

@@ -1,4 +1,4 @@
-//! That the memory of a host stays within its bounds, whatever its peers do: a look after each pass.
+//! Checks after each pass that the memory of a host stays within its bounds, for any behaviour of its peers.
 
 use crate::{
     engine::{Engine, quic::transport::STREAMS_OPEN},
@@ -11,16 +11,16 @@ const LINKS: usize = 160;
 const OPENING: usize = 64 + 16;
 /// Bytes of the messages of one identity that have not all come, as `engine/account` limits them.
 const OF_IDENTITY: usize = 80 << 20;
-/// What a stream holds besides: the rest of a packet, or a message that came in one.
+/// Additional bytes that a stream may hold: the rest of a packet, or a message that came in one.
 const OF_STREAM: usize = 9_000;
 /// A message beyond the memory of the identity, for each daemon id.
 const SPARE: usize = 32 << 10;
 /// Control messages of one connection that wait to be sent.
 const UNSENT: usize = (64 << 20) + MAX_FRAME;
-/// What one connection has unread, as `transport.rs` limits it.
+/// Maximum number of unread bytes of one connection, as `transport.rs` limits it.
 const UNREAD: usize = 65 << 20;
 
-/// Checks the bounds of a host, which had so many dials begun of late.
+/// Checks the bounds of a host that recently began `dials` dials.
 ///
 /// # Panics
 /// It holds more than it may.
@@ -28,11 +28,11 @@ pub(super) fn check(engine: &Engine, queue: usize, dials: usize) {
     let held = engine.links.held();
     assert!(held.links <= LINKS, "{held:?}");
     assert!(held.opening <= OPENING + dials && held.dials <= dials, "{held:?}, {dials} dials");
-    // As many again are closed, and are forgotten after three probe timeouts.
+    // The same number may be closed; they are forgotten after three probe timeouts.
     let open = LINKS + OPENING + dials;
     assert!(held.connections <= 2 * open, "{held:?}");
     assert!(held.unsent <= UNSENT && held.unhandled <= UNREAD, "{held:?}");
-    // Control messages are handled one by one: what a pass leaves to the next is of data streams.
+    // Control messages are handled one by one, so all events that a pass leaves to the next belong to data streams.
     assert!(held.events <= STREAMS_OPEN as usize * (held.links + 1), "{held:?}");
     let mut identities = std::collections::HashMap::new();
     for (_, peer) in engine.peers.iter() {

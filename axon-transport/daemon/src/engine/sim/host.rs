@@ -49,7 +49,7 @@ use crate::{
 pub(super) const PORT: u16 = 61_300;
 /// Datagrams that leave together at most.
 pub(super) const BATCH: usize = 44;
-/// What the thread that compresses samples takes in, in bytes a second.
+/// Rate of the thread that compresses samples, in bytes a second.
 const COMPRESSOR: f64 = 300e6;
 
 /// A simulated host.
@@ -69,7 +69,7 @@ pub(super) struct Host {
     seed: u64,
     starts: u32,
     discovery: SimDiscovery,
-    /// The endpoints of each peer, as the control plane was told.
+    /// The endpoints of each peer, as reported to the control plane.
     pub(super) graph: BTreeMap<DaemonId, BTreeMap<Gid, RemoteEndpoint>>,
     pub(super) status: BTreeMap<String, LinkStatus>,
     pub(super) refusals: VecDeque<(Duration, String)>,
@@ -81,7 +81,7 @@ pub(super) struct Host {
     interfaces_asked: bool,
     /// Samples that were compressed, and when the answers are due.
     compressed: VecDeque<(Duration, CompressionAnswer)>,
-    /// How many samples were compressed.
+    /// The number of compressed samples.
     pub(super) compressions: u64,
     used: BTreeSet<String>,
     graph_changed: bool,
@@ -97,7 +97,7 @@ pub(super) struct Host {
 }
 
 impl Host {
-    /// A host whose daemon is not started.
+    /// Creates a host whose daemon is not started.
     pub(super) fn new(number: usize, config: Config, seed: u64, epoch: Instant) -> Self {
         let [high, low] = (number as u16 + 1).to_be_bytes();
         Self {
@@ -191,17 +191,17 @@ impl Host {
         self.graph_changed = true;
     }
 
-    /// The peers that are linked.
+    /// Returns the linked peers.
     pub(super) fn linked(&self) -> BTreeSet<DaemonId> {
         self.discovery.linked()
     }
 
-    /// How many superseded links it has.
+    /// Returns the number of superseded links.
     pub(super) fn leaving(&self) -> usize {
         self.engine.as_ref().map_or(0, |engine| engine.links.leaving().len())
     }
 
-    /// Kills the daemon: it says nothing, and its state is gone.
+    /// Kills the daemon: it sends nothing more, and its state is gone.
     pub(super) fn kill(&mut self) {
         self.due.set(None);
         self.engine = None;
@@ -209,7 +209,7 @@ impl Host {
         self.graph.clear();
     }
 
-    /// Whether the daemon runs.
+    /// Returns whether the daemon runs.
     pub(super) fn is_running(&self) -> bool {
         self.engine.is_some()
     }
@@ -223,7 +223,7 @@ impl Host {
         }
     }
 
-    /// The host's SAE ID, in qkd.
+    /// Returns the host's SAE ID, in qkd.
     pub(super) fn sae(&self) -> Option<String> {
         match &self.config.security {
             axon_transport::config::Security::Classic(_) => None,
@@ -231,7 +231,7 @@ impl Host {
         }
     }
 
-    /// Has the host link with a peer. The lower id dials.
+    /// Makes the host link with a peer. The lower id dials.
     pub(super) fn want(
         &mut self,
         daemon: DaemonId,
@@ -249,48 +249,49 @@ impl Host {
         self.discovery.unwant(daemon);
     }
 
-    /// Samples that wait for peers, in bytes.
+    /// Returns the bytes of the samples that wait for peers, and the number of bytes that have left the queues.
     pub(super) fn backlog(&self) -> (usize, usize) {
         self.engine.as_ref().map_or((0, 0), Engine::backlog)
     }
 
-    /// Bytes of samples that were read from QUIC and are not in a ring, of all peers.
+    /// Returns the bytes of all peers' samples that were read from QUIC and are not in a ring.
     pub(super) fn held_of_messages(&self) -> usize {
         let peers = self.engine.iter().flat_map(|engine| engine.peers.iter());
         peers.map(|(_, peer)| peer.inbound.held().1).sum()
     }
 
-    /// Bytes of refused routes that are remembered, of all peers.
+    /// Returns the bytes of all peers' refused routes that are remembered.
     pub(super) fn held_of_refusals(&self) -> usize {
         let peers = self.engine.iter().flat_map(|engine| engine.peers.iter());
         peers.map(|(_, peer)| peer.held_of_refusals()).sum()
     }
 
-    /// The most that control messages of one peer took that were decompressed and not handled, in bytes.
+    /// Returns the maximum number of bytes that decompressed and unhandled control messages of one peer took.
     pub(super) fn most_decoded(&self) -> usize {
         let peers = self.engine.iter().flat_map(|engine| engine.peers.iter());
         peers.map(|(_, peer)| peer.remote.account().decoded.peak()).max().unwrap_or(0)
     }
 
-    /// Bytes that control messages of all peers took while they were decompressed and handled, since their links began.
+    /// Returns the number of bytes that control messages of all peers took while they were decompressed and handled,
+    /// since their links began.
     pub(super) fn handled(&self) -> usize {
         let peers = self.engine.iter().flat_map(|engine| engine.peers.iter());
         peers.map(|(_, peer)| peer.remote.account().decoded.released()).sum()
     }
 
-    /// Endpoints of all peers that are known, or left out.
+    /// Returns the number of endpoints of all peers that are known, or left out.
     pub(super) fn heard_endpoints(&self) -> u64 {
         let peers = self.engine.iter().flat_map(|engine| engine.peers.iter());
         peers.map(|(_, peer)| peer.remote.len() as u64 + peer.remote.left_out()).sum()
     }
 
-    /// The most control messages of one peer that waited to be read, in bytes.
+    /// Returns the maximum number of bytes of control messages that waited until one peer read them.
     pub(super) fn most_unsent(&self) -> usize {
         let peers = self.engine.iter().flat_map(|engine| engine.peers.iter());
         peers.map(|(_, peer)| peer.remote.account().unsent.peak()).max().unwrap_or(0)
     }
 
-    /// Publishers, servers and clients of all peers that are shown here.
+    /// Returns the number of publishers, servers and clients of all peers that are shown here.
     pub(super) fn shown(&self) -> usize {
         let peers = self.engine.iter().flat_map(|engine| engine.peers.iter());
         peers.map(|(_, peer)| peer.stand_ins()).sum()
@@ -309,38 +310,38 @@ impl Host {
         }
     }
 
-    /// Discovery heard of the addresses of a peer.
+    /// Passes the addresses of a peer to discovery, as its beacons would.
     pub(super) fn hear_addresses(&mut self, daemon: DaemonId, addresses: &[Ipv4Addr]) {
         self.due.set(None);
         let addresses = addresses.iter().map(|a| SocketAddr::from((*a, PORT))).collect();
         self.discovery.hear_addresses(daemon, addresses);
     }
 
-    /// A peer has another address.
+    /// Sets a new address of a peer.
     pub(super) fn moved(&mut self, daemon: DaemonId, address: Ipv4Addr) {
         self.due.set(None);
         self.discovery.set_address(daemon, SocketAddr::from((address, PORT)));
     }
 
-    /// The endpoints of the host changed.
+    /// Marks the endpoints of the host as changed.
     pub(super) fn touch_graph(&mut self) {
         self.due.set(None);
         self.graph_changed = true;
     }
 
-    /// Other access rules count from now on.
+    /// Sets other access rules.
     pub(super) fn set_access(&mut self, rules: &str) {
         let access = AccessRules::parse(rules, "access.toml").unwrap();
         self.set_rules(TrafficRules { access, ..TrafficRules::of(&self.config) });
     }
 
-    /// Other rules count from now on.
+    /// Sets other traffic rules.
     pub(super) fn set_rules(&mut self, rules: TrafficRules) {
         self.due.set(None);
         self.rules = Some(rules);
     }
 
-    /// Whether the host knows the endpoints of another one, and no more of it.
+    /// Returns whether the host knows all endpoints of another one, and no others of it.
     pub(super) fn knows(&self, other: &Self) -> bool {
         let shown = other.rings.endpoints();
         self.graph.get(&other.daemon).is_some_and(|known| {
@@ -348,19 +349,19 @@ impl Host {
         })
     }
 
-    /// A tool asks what a peer lets this host do.
+    /// Asks, for a tool, what a peer lets this host do.
     pub(super) fn check_access(&mut self, daemon: DaemonId, number: u64, uses: Vec<CheckedUse>) {
         self.due.set(None);
         self.questions.push(ToGateway::CheckAccess { daemon, number, uses });
     }
 
-    /// A ring rang.
+    /// Rings the host's doorbell.
     pub(super) fn ring(&mut self) {
         self.due.set(None);
         self.rings_rang = true;
     }
 
-    /// A datagram came.
+    /// Handles a datagram.
     pub(super) fn handle_datagram(
         &mut self,
         now: Duration,
@@ -375,7 +376,7 @@ impl Host {
         }
     }
 
-    /// The KME answered.
+    /// Handles an answer of the KME.
     pub(super) fn handle_key_event(&mut self, now: Duration, event: crate::keys::KmeAnswer) {
         self.due.set(None);
         if let Some(engine) = &mut self.engine {
@@ -383,7 +384,7 @@ impl Host {
         }
     }
 
-    /// When the host has something to do.
+    /// Returns when the host has something to do.
     pub(super) fn poll_timeout(&self, now: Duration) -> Option<Duration> {
         let due = self.due.get().unwrap_or_else(|| self.look_when_due(now));
         self.due.set(Some(due));
@@ -402,7 +403,7 @@ impl Host {
         parts.into_iter().flatten().min()
     }
 
-    /// One pass of the host.
+    /// Runs one pass of the host.
     pub(super) fn pass(&mut self, now: Duration) {
         self.due.set(None);
         let Some(engine) = &mut self.engine else { return };
@@ -505,7 +506,7 @@ impl Host {
             ToControl::Lost { topic, cause, samples } => {
                 *self.lost.entry((topic, cause)).or_default() += samples;
             }
-            // As the control plane answers a probe; beacons there are none.
+            // Answers a probe as the control plane does. There are no beacons.
             ToControl::Datagrams(datagrams) => {
                 for (to, bytes) in datagrams.iter() {
                     if let (Ok(Datagram::Probe { nonce, .. }), Some(engine)) =
@@ -527,7 +528,7 @@ impl Host {
         }
     }
 
-    /// The next packets.
+    /// Returns the next packets.
     pub(super) fn poll_transmit(
         &mut self,
         buffer: &mut Vec<u8>,

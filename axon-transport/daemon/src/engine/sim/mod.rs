@@ -1,10 +1,10 @@
 //! Drives many engines in one process, with a virtual clock, a simulated network and a script of faults.
 //!
-//! Everything follows from one seed, but for the bytes of TLS. [`network`] carries datagrams, [`script`] says which
-//! fault happens when, [`trace`] tells whether two runs were the same, and [`rng`] gives each part its own generator.
-//! [`host`] runs the engine of one host. [`rings`] models its rings, and [`discovery`] chooses the hosts that it dials. [`world`]
-//! holds all hosts and the clock. [`run`] runs a script in a world. [`raw`] is a peer without an engine. [`held`] checks that
-//! memory is bounded. [`pair`] runs two QUIC connections without any of this.
+//! One seed determines everything except the bytes of TLS. [`network`] carries datagrams, [`script`] schedules the
+//! faults, [`trace`] shows whether two runs were the same, and [`rng`] gives each part its own generator. [`host`] runs
+//! the engine of one host. [`rings`] models its rings, and [`discovery`] chooses the hosts that it dials. [`world`]
+//! holds all hosts and the clock. [`run`] runs a script in a world. [`raw`] is a peer without an engine. [`held`]
+//! checks that memory is bounded. [`pair`] runs two QUIC connections without the rest of the simulator.
 
 mod discovery;
 mod held;

@@ -1,4 +1,4 @@
-//! Two ends of one QUIC connection, for tests of what writes to streams. Nothing is lost on the way.
+//! Two ends of one QUIC connection, for tests of code that writes to streams. No packet is lost on the way.
 
 use std::{
     net::{Ipv4Addr, SocketAddr},
@@ -42,7 +42,7 @@ impl End {
 }
 
 impl Pair {
-    /// Two ends that have shaken hands.
+    /// Creates two ends that have completed the handshake.
     pub(crate) fn new() -> Self {
         let config = Arc::new(Config::default());
         let Security::Classic(classic) = &config.security else { panic!("classic alone") };
@@ -66,17 +66,17 @@ impl Pair {
         pair
     }
 
-    /// The time.
+    /// Returns the time.
     pub(crate) fn now(&self) -> Duration {
         self.now
     }
 
-    /// The client's end.
+    /// Returns the client's end.
     pub(crate) fn client(&mut self) -> &mut quinn_proto::Connection {
         &mut self.ends[0].connection.as_mut().unwrap().quic
     }
 
-    /// The client's end as a carrier of samples that TLS alone protects.
+    /// Returns the client's end as a carrier of samples that TLS alone protects.
     pub(crate) fn carrier(&mut self) -> Carrier<'_> {
         self.ends[0].connection.as_mut().unwrap().carrier(Seal::Link, self.now)
     }
@@ -103,7 +103,7 @@ impl Pair {
         while self.client().poll().is_some() {}
     }
 
-    /// Carries the packets that one end has. Returns whether there were any.
+    /// Carries the packets of one end to the other. Returns whether there were any.
     fn carry(&mut self, from: usize) -> bool {
         let (now, mut buffer) = (self.epoch + self.now, Vec::new());
         let End { address, endpoint, connection } = &mut self.ends[from];
@@ -131,7 +131,8 @@ impl Pair {
         true
     }
 
-    /// What the server has of a stream of the client, and whether the stream is finished. `None`: it was reset.
+    /// Reads the bytes that the server has of a stream of the client. Also returns whether the stream is finished.
+    /// `None`: it was reset.
     pub(crate) fn read(&mut self, stream: StreamId) -> Option<(Vec<u8>, bool)> {
         let mut stream = self.server().recv_stream(stream);
         let (mut all, mut chunks) = (Vec::new(), stream.read(true).ok()?);
@@ -147,7 +148,7 @@ impl Pair {
         Some((all, false))
     }
 
-    /// The server wants no more of a stream of the client. The client knows it afterwards.
+    /// Makes the server stop a stream of the client, and tells the client.
     pub(crate) fn stop(&mut self, stream: StreamId) {
         self.server().recv_stream(stream).stop(VarInt::from_u32(0)).unwrap();
         self.exchange();

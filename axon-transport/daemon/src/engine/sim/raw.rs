@@ -1,5 +1,5 @@
-//! A peer without an engine. It completes the TLS handshake as any peer does, and then says what a test has it say:
-//! frames out of order, streams of routes that nobody asked for, bytes that are no frame.
+//! A peer without an engine. It completes the TLS handshake as any peer does, and then sends what a test demands:
+//! frames out of order, streams of routes that no side asked for, bytes that are not a frame.
 
 use std::{
     collections::VecDeque,
@@ -27,11 +27,11 @@ use crate::{
     link::{CloseCode, LinkHello, LinkMessage, MAX_FRAME, MAX_INFLATED, read_length},
 };
 
-/// A peer that a test speaks for, in classic mode.
+/// A peer that a test controls, in classic mode.
 pub(super) struct Raw {
     pub(super) address: Ipv4Addr,
     pub(super) daemon: DaemonId,
-    /// Its connections, in the order in which they began.
+    /// The peer's connections, in the order in which they began.
     pub(super) links: Vec<RawLink>,
     config: Arc<Config>,
     credentials: Credentials,
@@ -49,22 +49,22 @@ pub(super) struct RawLink {
     pub(super) connected: bool,
     /// The control stream.
     pub(super) control: Option<StreamId>,
-    /// What came on the control stream and is no whole frame yet.
+    /// Bytes of the control stream that are not yet a whole frame.
     partial: Vec<u8>,
     /// The messages that came on the control stream.
     pub(super) messages: Vec<LinkMessage>,
     /// It reads nothing more of the control stream.
     pub(super) is_deaf: bool,
-    /// The data streams that the other side opened. Nobody reads them but a test.
+    /// The data streams that the other side opened. Only a test reads them.
     pub(super) opened: Vec<StreamId>,
-    /// How the other side closed it, or why it was lost.
+    /// The close of the other side, or the reason why the connection was lost.
     pub(super) closed: Option<(Option<CloseCode>, String)>,
     /// Bytes that QUIC did not take.
     waiting: VecDeque<(StreamId, Bytes)>,
 }
 
 impl Raw {
-    /// A peer at the address of host number `host`.
+    /// Creates a peer at the address of host number `host`.
     pub(super) fn new(host: usize, config: Config, daemon: DaemonId, epoch: Instant) -> Self {
         let [high, low] = (host as u16 + 1).to_be_bytes();
         let mut random: SimRng = stream(0, Stream::Host { host: host as u32, start: u32::MAX });
@@ -120,13 +120,13 @@ impl Raw {
         });
     }
 
-    /// The HELLO of an honest peer.
+    /// Returns the HELLO of an honest peer.
     pub(super) fn hello(&self) -> LinkHello {
         let routes = Some(MAX_ROUTES as u32);
         LinkHello { routes, host: "raw".into(), ..LinkHello::new(&self.config, self.daemon) }
     }
 
-    /// Says HELLO on a link.
+    /// Sends HELLO on a link.
     pub(super) fn say_hello(&mut self, link: usize) {
         let hello = self.hello();
         self.links[link].say(&LinkMessage::Hello(hello));
@@ -138,7 +138,7 @@ impl Raw {
         quic.close(self.epoch + now, VarInt::from_u32(0), Bytes::new());
     }
 
-    /// A datagram came.
+    /// Handles a datagram.
     pub(super) fn handle_datagram(
         &mut self,
         now: Duration,
@@ -166,13 +166,13 @@ impl Raw {
         }
     }
 
-    /// When [`pass`](Self::pass) is due.
+    /// Returns when [`pass`](Self::pass) is due.
     pub(super) fn poll_timeout(&mut self) -> Option<Duration> {
         let due = self.links.iter_mut().filter_map(|link| link.quic.poll_timeout()).min()?;
         Some(due.saturating_duration_since(self.epoch))
     }
 
-    /// Handles what came and what is due.
+    /// Handles events and due timers.
     pub(super) fn pass(&mut self, now: Duration) {
         for link in &mut self.links {
             let Some(handle) = link.handle else { continue };
@@ -191,7 +191,7 @@ impl Raw {
         }
     }
 
-    /// The next packets.
+    /// Returns the next packets.
     pub(super) fn poll_transmit(&mut self, now: Duration) -> Option<(Transmit, Vec<u8>)> {
         if let Some(response) = self.responses.pop_front() {
             return Some(response);
@@ -268,12 +268,12 @@ impl RawLink {
         all
     }
 
-    /// Says a message on the control stream.
+    /// Sends a message on the control stream.
     pub(super) fn say(&mut self, message: &LinkMessage) {
         self.say_bytes(message.to_frame().unwrap().into());
     }
 
-    /// Writes bytes to the control stream, whatever they are.
+    /// Writes any bytes to the control stream.
     pub(super) fn say_bytes(&mut self, bytes: Bytes) {
         if let Some(control) = self.control {
             self.write_to(control, bytes);
@@ -302,7 +302,7 @@ impl RawLink {
             match self.quic.send_stream(*stream).write(bytes) {
                 Ok(taken) => drop(bytes.split_to(taken)),
                 Err(quinn_proto::WriteError::Blocked) => {}
-                // Nobody takes the rest.
+                // The other side accepts no more, so the rest is dropped.
                 Err(_) => return false,
             }
             if !bytes.is_empty() {
@@ -322,12 +322,12 @@ impl RawLink {
         let _ = self.quic.send_stream(stream).reset(VarInt::from_u32(code));
     }
 
-    /// Whether the other side's HELLO came.
+    /// Returns whether the other side's HELLO came.
     pub(super) fn is_greeted(&self) -> bool {
         self.messages.iter().any(|message| matches!(message, LinkMessage::Hello(_)))
     }
 
-    /// Whether the other side elected it.
+    /// Returns whether the other side elected the link.
     pub(super) fn is_elected(&self) -> bool {
         self.messages.iter().any(|message| matches!(message, LinkMessage::Elected(_)))
     }

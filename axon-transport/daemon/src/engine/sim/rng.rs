@@ -2,8 +2,8 @@
 
 use rand::{Rng, SeedableRng, rngs::Xoshiro256PlusPlus};
 
-/// The simulator's generator. `rand` guarantees its values over releases and platforms. A minor release may
-/// change what `random_range` and similar functions make of them; then old seeds give other runs.
+/// The simulator's generator. `rand` guarantees its values over releases and platforms. A minor release may change how
+/// `random_range` and similar functions use them; then old seeds give other runs.
 pub(crate) type SimRng = Xoshiro256PlusPlus;
 
 /// Purpose of a generator. Generators for different purposes are independent, so an additional draw for one

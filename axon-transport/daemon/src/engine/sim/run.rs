@@ -1,4 +1,4 @@
-//! Runs a script of faults in a world of hosts, and checks what must hold whatever happens.
+//! Runs a script of faults in a world of hosts, and checks the invariants.
 
 use std::{collections::BTreeMap, time::Duration};
 
@@ -18,8 +18,9 @@ use crate::keys::FailureKind;
 
 /// All hosts know each other again within this time after the last fault.
 const HEALS: Duration = Duration::from_secs(90);
-/// The same, where a daemon ended after its host got another address. In mode none the address decides whose endpoints
-/// they are, and nobody is at the old one who could say that the daemon is gone: QUIC gives the link up after 120 s.
+/// The same limit if a daemon ended after its host got another address. In mode none the address identifies the owner
+/// of endpoints, and no process at the old address can answer that the daemon is gone. QUIC gives the link up after 120
+/// s.
 const HEALS_AFTER_MOVE: Duration = Duration::from_secs(150);
 /// Samples that were on their way have arrived, or were counted, within this time after that.
 const QUIET: Duration = Duration::from_secs(40);
@@ -28,10 +29,10 @@ const QUIET: Duration = Duration::from_secs(40);
 struct Run<'a> {
     script: &'a Script,
     world: World,
-    /// Faults that are under way, with what ends them.
+    /// The faults in progress, with the data to end them.
     cuts: BTreeMap<usize, Vec<CutId>>,
     endpoints: BTreeMap<usize, Gid>,
-    /// How often each host is dead, or stopped, at present.
+    /// The number of faults that currently kill, or stop, each host.
     dead: Vec<u32>,
     stopped: Vec<u32>,
     bursts: Vec<Burst>,
@@ -72,7 +73,7 @@ pub(super) fn run(script: &Script, config: impl Fn(usize) -> Config) {
     run.check();
 }
 
-/// Whether a daemon ends whose host gets another address.
+/// Returns whether a daemon ends whose host gets another address.
 fn moves_and_ends(script: &Script) -> bool {
     let moved: Vec<_> = script
         .faults
@@ -238,7 +239,7 @@ impl Run<'_> {
         }
     }
 
-    /// What must hold once all is quiet.
+    /// Checks the invariants once all is quiet.
     fn check(&self) {
         for host in &self.world.hosts {
             let (waiting, _) = host.backlog();
@@ -248,7 +249,7 @@ impl Run<'_> {
     }
 }
 
-/// The name of a topic.
+/// Returns the name of a topic.
 pub(super) fn name(topic: usize) -> String {
     let kind = if topic % 2 == 1 { COMPRESSIBLE } else { "/topic" };
     format!("{kind}{topic}")

@@ -34,7 +34,7 @@ pub(super) fn classic(_host: usize) -> Config {
 /// Makes the settings of a host.
 pub(super) type Settings = Box<dyn Fn(usize) -> Config>;
 
-/// All modes that a link can have here.
+/// Returns all modes that a link can have here.
 pub(super) fn modes() -> Vec<(&'static str, Settings)> {
     let of = |mode| move |host: usize| qkd(&format!("sae-{host}"), mode);
     vec![
@@ -100,7 +100,7 @@ fn a_lone_sample_leaves_in_pieces_and_a_stream_in_whole_batches() {
         world.run_for(millis(20));
         world.batches.remove(&0).unwrap()
     };
-    // Until the congestion window lets a whole sample leave at once.
+    // These samples widen the congestion window until a whole sample can leave at once.
     for _ in 0..20 {
         lone(&mut world);
     }
@@ -158,7 +158,7 @@ fn a_full_keep_all_ring_holds_the_publisher_back_and_loses_nothing() {
     assert!(!world.hosts[1].rings.waits_for_room());
 }
 
-/// Offers best-effort samples of 512 KiB to a path of 54 Mbit/s for 20 s, `load` times what it carries. Returns the
+/// Offers best-effort samples of 512 KiB to a path of 54 Mbit/s for 20 s, at `load` times the path's rate. Returns the
 /// share that arrives, and the median of their ages.
 fn best_effort_overload(load: f64, depth: u32) -> (f64, Duration) {
     let mut world = World::new(7, 2, classic);
@@ -272,7 +272,7 @@ fn a_wall_clock_that_jumps_on_one_host_changes_nothing() {
     }
 }
 
-/// The script of a seed: mixed faults of so many hosts.
+/// Returns the script of a seed, with mixed faults of `hosts` hosts.
 fn script(seed: u64, hosts: usize) -> Script {
     let recipe = Recipe {
         hosts,
@@ -309,12 +309,12 @@ fn try_seed(seed: u64, hosts: usize) {
     panic!("seed {seed} with {hosts} hosts fails: {why}\nshrunk to:\n{}", shrunk.script);
 }
 
-/// Whether all cases of a scenario are wanted, or a sample of them.
+/// Returns whether all cases of a scenario are to be run, or only a sample of them.
 pub(super) fn all_cases() -> bool {
     setting("SIMULATE_ALL", 0) == 1
 }
 
-/// A number from the environment, as `cargo xtask simulate` sets it.
+/// Returns a number from the environment, as `cargo xtask simulate` sets it.
 pub(super) fn setting(name: &str, default: u64) -> u64 {
     std::env::var(name).ok().and_then(|value| value.parse().ok()).unwrap_or(default)
 }

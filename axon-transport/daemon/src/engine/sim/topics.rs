@@ -1,4 +1,4 @@
-//! Two hosts with very many topics: what a sample, and what doing nothing, costs is counted.
+//! Tests two hosts with very many topics: counts the cost of a sample, and the cost of an idle host.
 
 use std::time::Duration;
 
@@ -17,7 +17,7 @@ struct Topics {
 }
 
 impl Topics {
-    /// So many topics, all of them matched.
+    /// Creates `count` matched topics.
     fn matched(count: usize, qos: Qos) -> Self {
         let mut world = World::new(7, 2, |_| Config::default());
         let pair = |topic| {
@@ -97,7 +97,8 @@ fn a_topic_whose_ring_is_to_be_looked_at_again_keeps_its_stream() {
     // Each stream is open, and carries nothing.
     (0..streams).for_each(|topic| topics.publish(topic));
     topics.world.run_for(Duration::from_secs(2));
-    // More than one look passes over, and one behind them, while others ask for streams.
+    // Topic 0 has more samples than one look passes over, and a valid one behind them, while other flows ask for
+    // streams.
     (0..160).for_each(|_| topics.publish(0));
     topics.world.hosts[0].rings.expire(topics.pairs[0].0);
     topics.publish(0);

@@ -35,8 +35,8 @@ impl Trace {
         }
     }
 
-    /// Records an event at a host. `values` are what tells it apart: lengths, numbers, peers. Leave out bytes
-    /// that differ from run to run, such as TLS randoms.
+    /// Records an event at a host. `values` distinguish it: lengths, numbers, peers. Leave out bytes that differ from
+    /// run to run, such as TLS randoms.
     pub(crate) fn event(
         &mut self,
         at: Duration,
@@ -70,13 +70,13 @@ impl Trace {
         self.hasher.finish()
     }
 
-    /// Returns how many events were recorded, those that left the ring included.
+    /// Returns the number of recorded events, including those that have left the ring.
     pub(crate) fn events(&self) -> u64 {
         self.events
     }
 }
 
-/// The last events, one a line, below a line that says how many came before and what the hash is.
+/// Prints the last events, one a line, below a line with the hash and the number of events that came before.
 impl fmt::Display for Trace {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let left = self.events - self.last.len() as u64;

@@ -63,14 +63,14 @@ pub(super) struct Pair {
 }
 
 impl World {
-    /// So many hosts with these settings; their daemons are started and link with each other.
+    /// Creates `hosts` hosts with these settings. Their daemons are started and link with each other.
     pub(super) fn new(seed: u64, hosts: usize, config: impl Fn(usize) -> Config) -> Self {
         let mut world = Self::apart(seed, hosts, config);
         (0..hosts).for_each(|host| world.introduce(host));
         world
     }
 
-    /// As [`new`](Self::new), but nobody dials.
+    /// Creates hosts like [`new`](Self::new), but no host dials.
     pub(super) fn apart(seed: u64, hosts: usize, config: impl Fn(usize) -> Config) -> Self {
         let epoch = Instant::now();
         let mut network = Network::new(seed);
@@ -96,7 +96,7 @@ impl World {
         }
     }
 
-    /// Tells all hosts of a host's daemon, and the other way round.
+    /// Makes each other host link with a host's daemon, and the other way round.
     fn introduce(&mut self, of: usize) {
         for other in (0..self.hosts.len()).filter(|other| *other != of) {
             self.tell(other, of);
@@ -104,7 +104,7 @@ impl World {
         }
     }
 
-    /// Has a host link with another one, which it dials.
+    /// Makes a host link with another one, which it dials.
     pub(super) fn tell(&mut self, host: usize, of: usize) {
         let other = &self.hosts[of];
         let (daemon, address, sae) = (other.daemon, other.address, other.sae());
@@ -120,7 +120,7 @@ impl World {
         second
     }
 
-    /// Has each host hear the beacons of all others, from all their addresses.
+    /// Makes each host hear the beacons of all others, from all their addresses.
     pub(super) fn hear_all_addresses(&mut self) {
         for host in 0..self.hosts.len() {
             for other in (0..self.hosts.len()).filter(|other| *other != host) {
@@ -132,7 +132,7 @@ impl World {
         }
     }
 
-    /// Adds a peer that a test speaks for. Returns its number among those.
+    /// Adds a raw peer, which a test controls. Returns its number among the raw peers.
     pub(super) fn add_raw(&mut self, config: Config, daemon: DaemonId) -> usize {
         let host = self.hosts.len() + self.raws.len();
         let raw = Raw::new(host, config, daemon, self.epoch);
@@ -141,7 +141,7 @@ impl World {
         self.raws.len() - 1
     }
 
-    /// Has a raw peer do something, and sends what comes of it.
+    /// Calls `act` on a raw peer, and sends the resulting packets.
     pub(super) fn with_raw<T>(
         &mut self,
         number: usize,
@@ -170,7 +170,7 @@ impl World {
         self.hosts[host].kill();
     }
 
-    /// Has a host's daemon end in order, as far as it comes before it is killed.
+    /// Makes a host's daemon end in order, as far as it gets before it is killed.
     pub(super) fn close(&mut self, host: usize) {
         self.hosts[host].close(self.now);
         self.transmit(host);
@@ -196,7 +196,7 @@ impl World {
         self.hosts.iter_mut().for_each(|other| other.moved(daemon, address));
     }
 
-    /// Two hosts get each other's address, which all learn.
+    /// Swaps the addresses of two hosts. All hosts learn the new addresses.
     pub(super) fn swap_hosts(&mut self, one: usize, other: usize) {
         let [first, second] = [one, other].map(|host| self.hosts[host].address);
         self.move_host(one);
@@ -210,7 +210,7 @@ impl World {
         }
     }
 
-    /// Has each publisher of a topic on a host publish a sample.
+    /// Makes each publisher of a topic on a host publish a sample.
     pub(super) fn publish_all(&mut self, host: usize, topic: usize, size: usize) {
         let publishers = self.hosts[host].rings.publishers(&super::run::name(topic));
         for publisher in publishers {
@@ -219,9 +219,9 @@ impl World {
         }
     }
 
-    /// For each RELIABLE and KEEP_ALL pair of which samples came: the publisher, and the subscription with the samples that
-    /// are missing after the first that came. What was published while no relay stood for the subscription was never for
-    /// it: its host, or the publisher's daemon, was not there.
+    /// Returns each RELIABLE and KEEP_ALL pair that transferred a sample: the publisher, the subscription, and the
+    /// number of samples that are missing after the first that came. Samples that were published while no relay stood
+    /// for the subscription do not count: its host, or the publisher's daemon, was not there.
     fn losses(&self) -> Vec<(HostEndpoint, (HostEndpoint, u64))> {
         let mut losses = Vec::new();
         for there in &self.hosts {
@@ -244,7 +244,7 @@ impl World {
         losses
     }
 
-    /// What must hold once all is quiet: no RELIABLE and KEEP_ALL sample is missing but those that were given up.
+    /// Checks, once all is quiet, that no RELIABLE and KEEP_ALL samples are missing except those that were given up.
     pub(super) fn check_losses(&self, case: &str) {
         for (from, to) in self.losses() {
             let (missing, given_up) = (to.1, self.hosts[from.0].rings.given_up(from.1));
@@ -287,7 +287,7 @@ impl World {
         published
     }
 
-    /// The numbers of the samples that arrived.
+    /// Returns the numbers of the samples that arrived.
     pub(super) fn received(&self, pair: Pair) -> Vec<u64> {
         let (host, subscription) = pair.subscription;
         self.hosts[host].rings.received(subscription, pair.publisher.1)
@@ -297,7 +297,7 @@ impl World {
         if self.stopped[host] { None } else { self.hosts[host].poll_timeout(self.now) }
     }
 
-    /// The time of the next event.
+    /// Returns the time of the next event.
     pub(super) fn next(&mut self) -> Option<Duration> {
         let raws = self.raws.iter_mut().filter_map(Raw::poll_timeout).min();
         let hosts = (0..self.hosts.len()).filter_map(|host| self.due(host)).min();
@@ -329,7 +329,7 @@ impl World {
         self.run_until(self.now + time);
     }
 
-    /// Runs until this holds, or panics with what all hosts say after so long.
+    /// Runs until `holds` returns true. Panics with the state of all hosts if that takes `most` or longer.
     pub(super) fn until(&mut self, most: Duration, holds: impl Fn(&Self) -> bool) {
         let end = self.now + most;
         while !holds(self) {
@@ -340,8 +340,8 @@ impl World {
         }
     }
 
-    /// One event: all that is due now. A host handles all datagrams that came at one time in one pass, as the reactor
-    /// does.
+    /// Handles one event: all that is due now. A host handles all datagrams that came at one time in one pass, as the
+    /// reactor does.
     fn step(&mut self) {
         let now = self.now;
         let mut came = BTreeSet::new();
@@ -418,7 +418,7 @@ impl World {
         }
     }
 
-    /// What must hold after each pass: no sample twice, none out of order, none damaged.
+    /// Checks the invariants after each pass: no sample came twice, out of order or damaged.
     fn check(&mut self, host: usize) {
         self.hosts[host].check_held(self.now);
         let rings = &self.hosts[host].rings;
@@ -436,7 +436,7 @@ impl World {
         }
     }
 
-    /// Whether all daemons that run are linked with each other.
+    /// Returns whether all running daemons are linked with each other.
     pub(super) fn is_linked(&self) -> bool {
         let running = self.hosts.iter().filter(|host| host.is_running());
         running.clone().all(|host| {
@@ -444,7 +444,7 @@ impl World {
         })
     }
 
-    /// Whether each host knows the endpoints of all others.
+    /// Returns whether each host knows the endpoints of all others.
     pub(super) fn is_whole(&self) -> bool {
         self.is_linked()
             && self.hosts.iter().filter(|host| host.is_running()).all(|host| {
@@ -453,7 +453,7 @@ impl World {
             })
     }
 
-    /// What all hosts say, for a failure.
+    /// Describes the state of all hosts, for a failure.
     pub(super) fn describe(&self) -> String {
         let mut text = format!("at {:?}\n", self.now);
         for host in &self.hosts {

@@ -21,7 +21,7 @@ pub(crate) enum Cause {
     NoSocket,
     /// The receive buffer of a paused host is full.
     ReceiveBuffer,
-    /// More in flight than the simulator allows. It says nothing about the engine: raise the limit.
+    /// More packets were in flight than the simulator allows. This is no fault of the engine: raise the limit.
     InFlightLimit,
 }
 

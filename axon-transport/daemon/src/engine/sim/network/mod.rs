@@ -1,9 +1,9 @@
 //! A simulated IPv4 network that carries UDP datagrams between hosts.
 //!
-//! A packet passes, in this order: the sender's NAT, its interface's rate, the path's MTU, rate, loss,
-//! delay and duplication, the receiver's interface's rate, its NAT, and the receive buffer of a paused host.
-//! Partitions, addresses and NAT mappings are looked up when the packet is sent and again when it arrives, so
-//! a change also hits what is in flight. What is refused at the first look takes nothing of a rate.
+//! A packet passes, in this order: the sender's NAT, its interface's rate, the path's MTU, rate, loss, delay and
+//! duplication, the receiver's interface's rate, its NAT, and the receive buffer of a paused host. Partitions,
+//! addresses and NAT mappings are looked up when the packet is sent and again when it arrives, so a change also hits
+//! packets in flight. A packet that is refused when it is sent uses nothing of a rate.
 //!
 //! The network is plain data. Its time is a `Duration` since the start of the run and does not go back. With
 //! one seed and one sequence of calls, its deliveries are the same.
@@ -50,7 +50,7 @@ pub(crate) const RECEIVE_BUFFER: usize = 4 << 20;
 pub(crate) struct Delivery {
     /// Index of the host.
     pub(crate) host: usize,
-    /// Its own address and port, behind the NAT if there is one.
+    /// The sender's own address and port, behind the NAT if there is one.
     pub(crate) at: SocketAddr,
     /// The sender, as the receiver sees it.
     pub(crate) from: SocketAddr,
@@ -113,10 +113,10 @@ struct Packet {
     bytes: Bytes,
 }
 
-/// How far a packet has come at its time of arrival.
+/// The progress of a packet at its time of arrival.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Stage {
-    /// To the end of the path.
+    /// The packet has reached the end of the path.
     Path,
     /// Through the rate of the receiving interface.
     Interface,
@@ -405,7 +405,7 @@ impl Network {
         self.packets_in_flight
     }
 
-    /// Bounds what is in flight. Further packets are dropped with [`Cause::InFlightLimit`].
+    /// Limits the packets in flight and their bytes. Further packets are dropped with [`Cause::InFlightLimit`].
     pub(crate) fn set_in_flight_limit(&mut self, packets: usize, bytes: usize) {
         (self.max_packets, self.max_bytes) = (packets, bytes);
     }

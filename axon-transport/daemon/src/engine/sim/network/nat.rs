@@ -11,14 +11,14 @@ use super::nanos;
 /// Which incoming packets a NAT forwards.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Filtering {
-    /// All that go to a mapped port.
+    /// Accepts all packets to a mapped port.
     EndpointIndependent,
-    /// Those from an address and port to which the mapping has sent.
+    /// Accepts packets from an address and port to which the mapping has sent.
     AddressAndPortDependent,
 }
 
 const FIRST_PORT: u16 = 49_152;
-/// Remote endpoints that one mapping remembers. Packets from further ones are refused.
+/// Maximum number of remote endpoints that one mapping remembers. Packets from other endpoints are refused.
 const MAX_REMOTES: usize = 4_096;
 
 pub(super) struct Nat {
@@ -27,7 +27,7 @@ pub(super) struct Nat {
     /// Nanoseconds without an outgoing packet after which a mapping ends.
     lifetime: u64,
     next_port: u16,
-    /// Outer ports that are forwarded whatever was sent.
+    /// Outer ports that are always forwarded.
     forwards: BTreeMap<u16, SocketAddrV4>,
     by_port: HashMap<u16, Mapping>,
     by_inner: HashMap<SocketAddrV4, u16>,

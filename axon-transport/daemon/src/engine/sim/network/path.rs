@@ -109,7 +109,7 @@ impl Link {
         Self { rng, backlog: Backlog::default(), last_arrival: 0, in_bad_state: false, path: None }
     }
 
-    /// Decides what becomes of a packet of `bytes` (headers included) that enters the path at `now`.
+    /// Decides the fate of a packet of `bytes` (headers included) that enters the path at `now`.
     pub(super) fn cross(
         &mut self,
         default: &Path,

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use super::nanos;
 
-/// A rate and what happens to packets that come faster.
+/// A rate, and the treatment of packets that exceed it.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Rate {
     /// IP bytes per second. At 0 every packet is dropped.
@@ -26,7 +26,7 @@ pub(crate) enum QueueLimit {
 }
 
 impl Rate {
-    /// Returns a rate whose queue drops what would wait longer than `wait`, without ECN marks.
+    /// Returns a rate whose queue drops packets that would wait longer than `wait`, without ECN marks.
     pub(crate) fn new(bytes_per_second: u64, wait: Duration) -> Self {
         Self { bytes_per_second, limit: QueueLimit::Time(wait), mark_after: None }
     }

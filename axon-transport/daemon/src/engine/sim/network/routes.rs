@@ -1,4 +1,4 @@
-//! Where a packet goes: addresses, NAT, partitions.
+//! Finds the destination of a packet: addresses, NAT, partitions.
 
 use std::net::{IpAddr, SocketAddr, SocketAddrV4};
 
@@ -7,7 +7,7 @@ use crate::engine::sim::rng::{Stream, stream};
 
 const NO_LINK: u32 = u32::MAX;
 
-/// Where packets to an address go at the moment.
+/// The current route of packets to an address.
 #[derive(Clone, Copy)]
 pub(super) struct Route {
     pub(super) sender: usize,
@@ -79,7 +79,7 @@ impl Network {
             }
             Owner::Interface(interface) => {
                 let behind = self.interfaces[*interface as usize].nat;
-                // From outside, a private address is none.
+                // A private address is unreachable from outside its NAT.
                 let inside = match self.owners.get(from.ip()) {
                     Some(Owner::Interface(sender)) => self.interfaces[*sender as usize].nat,
                     _ => None,

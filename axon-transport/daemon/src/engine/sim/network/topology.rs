@@ -29,7 +29,7 @@ pub(crate) struct CutId(u64);
 
 /// Two sets of hosts; packets from the first to the second are dropped.
 pub(super) struct Cut {
-    /// By host: whether it is in the sending set.
+    /// For each host, whether it is in the sending set.
     from: Vec<bool>,
     to: Vec<bool>,
     /// Both directions.
@@ -112,8 +112,7 @@ impl Network {
         }
     }
 
-    /// Gives the interface with the address `from` the address `to`. What is in flight to the old address is
-    /// dropped.
+    /// Gives the interface with the address `from` the address `to`. Packets in flight to the old address are dropped.
     ///
     /// # Panics
     /// If no interface has `from`, or `to` is in use.
@@ -162,10 +161,10 @@ impl Network {
         assert!(other.is_none(), "{address} is in use by {other:?}");
     }
 
-    /// Sets the path of all pairs that have none of their own.
+    /// Sets the path of all pairs without a path of their own.
     ///
     /// # Panics
-    /// If a probability is outside 0..=1. That holds for each function that sets a path.
+    /// If a probability is outside 0..=1. The same holds for each function that sets a path.
     pub(crate) fn set_default_path(&mut self, path: Path) {
         path.validate();
         self.default_path = path;
@@ -266,7 +265,7 @@ impl Network {
         }
     }
 
-    /// Pauses a host: what arrives waits in its receive buffer of [`RECEIVE_BUFFER`](super::RECEIVE_BUFFER).
+    /// Pauses a host: packets that arrive wait in its receive buffer of [`RECEIVE_BUFFER`](super::RECEIVE_BUFFER).
     pub(crate) fn pause(&mut self, host: usize) {
         self.hosts[host].paused = true;
     }

@@ -29,7 +29,7 @@ use axon_transport::{
 use self::reader::SimReader;
 use crate::engine::rings::{RingError, RingReader, RingWriter, Rings};
 
-/// Samples that a publisher's ring holds, or as many as its depth.
+/// Minimum capacity of a publisher's ring in samples; a larger depth extends it.
 const RING: usize = 256;
 
 /// A local publisher.
@@ -61,11 +61,11 @@ struct State {
     active: Vec<(Gid, Gid)>,
     /// Samples that were published while a relay stood for a subscription of a peer, by publisher and subscription.
     promised: BTreeMap<(Gid, Gid), Vec<u64>>,
-    /// How often a relay was asked whether it has samples.
+    /// How often the engine asked a relay whether it has samples.
     looks: u64,
     /// Samples of each publisher up to this number are past their lifespan.
     expired: BTreeMap<Gid, u64>,
-    /// What was given up of each publisher.
+    /// Number of samples given up, by publisher.
     given_up: BTreeMap<Gid, u64>,
     /// Samples that came damaged.
     damaged: u64,
@@ -79,7 +79,7 @@ struct State {
     fails: bool,
 }
 
-/// How far a relay has read and acknowledged each publisher.
+/// The positions up to which a relay has read and acknowledged each publisher.
 struct Cursors {
     gid: Gid,
     spec: EndpointSpec,
@@ -98,22 +98,22 @@ pub(super) struct SimRings {
     session: SessionId,
     key: Arc<SessionKey>,
     state: Rc<RefCell<State>>,
-    /// What the wall clock of the host shows. Samples are stamped with it.
+    /// The host's wall clock, which stamps samples.
     pub(super) wall: Rc<Cell<SystemTime>>,
 }
 
-/// What the wall clock of a new host shows, since 1970: a day in 2026.
+/// The wall clock of a new host, since 1970: a day in 2026.
 const TODAY: Duration = Duration::from_secs(1_790_000_000);
-/// GIDs of endpoints of a peer without an engine begin with this. Nobody vouches for their samples.
+/// The first bytes of GIDs of a raw peer's endpoints. The rings do not check their samples.
 pub(super) const FOREIGN: [u8; 12] = [0xaa; 12];
 
-/// A key that the run's seed decides.
+/// Returns the key that the run's seed determines.
 pub(super) fn session_key(seed: &[u8; 32]) -> SessionKey {
     let packet = [&[OWNER, 0xa1, 0x00, 0x58, 0x20], &seed[..]].concat();
     SessionKey::from_packet(&packet).unwrap()
 }
 
-/// The payload of a sample: its number, its publisher and filling, so that damage shows.
+/// Returns the payload of a sample: its number, its publisher and filling, so that damage shows.
 pub(super) fn payload(of: Gid, sequence: u64, length: usize) -> Vec<u8> {
     let mut payload = Vec::with_capacity(24 + length);
     payload.extend_from_slice(&of.0);
@@ -133,7 +133,7 @@ pub(super) fn payload(of: Gid, sequence: u64, length: usize) -> Vec<u8> {
 /// Samples of topics whose names begin so become about a third as long when they are compressed. Others do not.
 pub(super) const COMPRESSIBLE: &str = "/text";
 
-/// The sample of this number of a publisher.
+/// Returns the sample of this number of a publisher.
 fn payload_of(publisher: &Endpoint, sequence: u64, length: usize) -> Vec<u8> {
     let mut payload = payload(publisher.gid, sequence, length);
     if !publisher.topic.starts_with(COMPRESSIBLE) {
@@ -147,7 +147,7 @@ fn payload_of(publisher: &Endpoint, sequence: u64, length: usize) -> Vec<u8> {
 }
 
 impl SimRings {
-    /// The rings of a host whose sessions have this number.
+    /// Creates the rings of a host whose sessions have this number.
     pub(super) fn new(host: usize) -> Self {
         let mut seed = [0x51; 32];
         seed[24..].copy_from_slice(&(host as u64).to_be_bytes());
@@ -156,7 +156,7 @@ impl SimRings {
         Self { session: key.id(), key, state: Rc::default(), wall }
     }
 
-    /// The key of the session that has the endpoints.
+    /// Returns the key of the session that has the endpoints.
     pub(super) fn key(&self) -> Arc<SessionKey> {
         Arc::clone(&self.key)
     }
@@ -200,7 +200,7 @@ impl SimRings {
         gid
     }
 
-    /// Ends a publisher or subscription. What a publisher left stays in its ring.
+    /// Ends a publisher or subscription. The samples of an ended publisher stay in its ring.
     pub(super) fn end(&self, gid: Gid) {
         let mut state = self.state.borrow_mut();
         state.subscriptions.remove(&gid);
@@ -218,7 +218,7 @@ impl SimRings {
         }
     }
 
-    /// Publishes a sample with so many bytes of filling. `false`: a KEEP_ALL reader has no room for it.
+    /// Publishes a sample with `length` bytes of filling. Returns `false` if a KEEP_ALL reader has no room for it.
     pub(super) fn publish(&self, publisher: Gid, length: usize) -> bool {
         let state = &mut *self.state.borrow_mut();
         let Some(of) = state.publishers.get_mut(&publisher) else { return false };
@@ -256,19 +256,19 @@ impl SimRings {
         true
     }
 
-    /// The lifespan of all samples of a publisher is over.
+    /// Ends the lifespan of all samples of a publisher.
     pub(super) fn expire(&self, publisher: Gid) {
         let state = &mut *self.state.borrow_mut();
         let published = state.publishers.get(&publisher).map_or(0, |p| p.published);
         state.expired.insert(publisher, published);
     }
 
-    /// Whether no relay and no stand-in can be opened from now on.
+    /// Sets whether opening a relay or stand-in fails from now on.
     pub(super) fn set_fails(&self, fails: bool) {
         self.state.borrow_mut().fails = fails;
     }
 
-    /// The endpoints that the host shows.
+    /// Returns the endpoints that the host shows.
     pub(super) fn endpoints(&self) -> Vec<Arc<Endpoint>> {
         let state = self.state.borrow();
         let publishers = state.publishers.values().map(|p| &p.endpoint);
@@ -277,39 +277,39 @@ impl SimRings {
         publishers.chain(subscriptions).cloned().collect()
     }
 
-    /// The numbers of the samples of a publisher that reached a subscription, as they came.
+    /// Returns the numbers of a publisher's samples that reached a subscription, in order of arrival.
     pub(super) fn received(&self, subscription: Gid, publisher: Gid) -> Vec<u64> {
         let state = self.state.borrow();
         let received = state.subscriptions.get(&subscription).map(|s| &s.received);
         received.and_then(|r| r.get(&publisher)).cloned().unwrap_or_default()
     }
 
-    /// How many samples a publisher published.
+    /// Returns how many samples a publisher published.
     pub(super) fn published(&self, publisher: Gid) -> u64 {
         self.state.borrow().publishers.get(&publisher).map_or(0, |p| p.published)
     }
 
-    /// Whether readers sleep though a stand-in wrote a sample for them.
+    /// Returns whether readers still sleep although a stand-in wrote a sample for them.
     pub(super) fn has_unannounced(&self) -> bool {
         !self.state.borrow().unannounced.is_empty()
     }
 
-    /// Samples of a publisher that relays gave up.
+    /// Returns the number of a publisher's samples that relays gave up.
     pub(super) fn given_up(&self, publisher: Gid) -> u64 {
         self.state.borrow().given_up.get(&publisher).copied().unwrap_or(0)
     }
 
-    /// Samples that were damaged on their way.
+    /// Returns the number of samples that were damaged on their way.
     pub(super) fn damaged(&self) -> u64 {
         self.state.borrow().damaged
     }
 
-    /// RELIABLE samples that came twice, or after a newer one.
+    /// Returns the number of RELIABLE samples that came twice, or after a newer one.
     pub(super) fn disordered(&self) -> u64 {
         self.state.borrow().disordered
     }
 
-    /// The publishers of a topic that have not ended.
+    /// Returns the publishers of a topic that have not ended.
     pub(super) fn publishers(&self, topic: &str) -> Vec<Gid> {
         let state = self.state.borrow();
         let of = state
@@ -319,12 +319,13 @@ impl SimRings {
         of.map(|(gid, _)| *gid).collect()
     }
 
-    /// The samples that a publisher published while a relay stood for a subscription of a peer.
+    /// Returns the samples that a publisher published while a relay stood for a subscription of a peer.
     pub(super) fn promised(&self, publisher: Gid, subscription: Gid) -> Vec<u64> {
         self.state.borrow().promised.get(&(publisher, subscription)).cloned().unwrap_or_default()
     }
 
-    /// Each RELIABLE and KEEP_ALL subscription, and each publisher of which it received a sample: the numbers that came.
+    /// Returns each RELIABLE and KEEP_ALL subscription with each publisher of which it received a sample, and the
+    /// numbers of the samples.
     pub(super) fn complete(&self) -> Vec<(Gid, Gid, Vec<u64>)> {
         let state = self.state.borrow();
         let keeping = state.subscriptions.iter().filter(|(_, s)| {
@@ -338,7 +339,7 @@ impl SimRings {
         of.collect()
     }
 
-    /// A publisher's QoS, if it has not ended.
+    /// Returns a publisher's QoS, if it has not ended.
     pub(super) fn publisher(&self, gid: Gid) -> Option<Qos> {
         let state = self.state.borrow();
         let publisher = state.publishers.get(&gid)?;
@@ -363,12 +364,12 @@ impl SimRings {
         open.map(of).sum()
     }
 
-    /// How often the engine asked a relay whether it has samples.
+    /// Returns how often the engine asked a relay whether it has samples.
     pub(super) fn looks(&self) -> u64 {
         self.state.borrow().looks
     }
 
-    /// Whether the engine waits for room.
+    /// Returns whether the engine waits for room.
     pub(super) fn waits_for_room(&self) -> bool {
         self.state.borrow().waits_for_room
     }
@@ -436,7 +437,7 @@ impl RingWriter for SimWriter {
         state.unannounced.insert(publisher);
         for subscription in &mut readers {
             let received = subscription.received.entry(publisher).or_default();
-            // As a session does: a sample that is not newer is dropped.
+            // A sample that is not newer is dropped, as in a session.
             if received.last().is_some_and(|last| *last >= meta.sequence) {
                 continue;
             }
@@ -479,7 +480,7 @@ impl Rings for SimRings {
         }
         state.next += 1;
         let late_join = spec.qos.durability == Durability::TransientLocal;
-        // A volatile reader gets what is published after it; an ended publisher's are all old.
+        // A volatile reader gets samples that are published later; all samples of an ended publisher are old.
         let known = state.publishers_of(&spec.topic).map(|(gid, p)| {
             let depth = u64::from(p.endpoint.qos.depth);
             let skip = if late_join { p.published.saturating_sub(depth) } else { p.published };
@@ -498,7 +499,7 @@ impl Rings for SimRings {
         let State { readers, topics, active, .. } = &mut *state;
         let topic = &cursors.spec.topic;
         readers.entry(topic.clone()).or_default().push(Rc::clone(&cursors));
-        // Those that are there may have history.
+        // Existing publishers may have history.
         let members = topics.get(topic).into_iter().flatten();
         active.extend(members.map(|member| (cursors.gid, *member)));
         drop(state);

@@ -1,4 +1,4 @@
-//! A relay: what the engine takes the samples of a publisher from.
+//! A relay, from which the engine takes the samples of publishers.
 
 use std::{collections::HashMap, rc::Rc, time::Duration};
 
@@ -12,7 +12,7 @@ use bytes::Bytes;
 use super::{Cursors, SimRings};
 use crate::engine::rings::RingReader;
 
-/// Samples that one take passes over since they do not count, as a session does.
+/// Maximum number of samples that one take passes over because they do not count, as in a session.
 const PASSED_OVER: usize = 64;
 
 /// A relay.
@@ -24,7 +24,7 @@ pub(super) struct SimReader {
 impl Drop for SimReader {
     fn drop(&mut self) {
         self.cursors.closed.set(true);
-        // A relay that ends gives up what is not acknowledged.
+        // A relay that ends gives up its unacknowledged samples.
         if self.cursors.spec.qos.reliability == Reliability::Reliable {
             for (publisher, samples) in self.unacknowledged() {
                 self.give_up(publisher, samples);
@@ -34,7 +34,7 @@ impl Drop for SimReader {
 }
 
 impl SimReader {
-    /// The next sample of a publisher after this reader's cursor.
+    /// Returns the next sample of a publisher after this reader's cursor.
     fn peek(&self, publisher: &Gid) -> Option<(u64, Vec<u8>)> {
         let state = self.rings.state.borrow();
         let of = state.publishers.get(publisher)?;

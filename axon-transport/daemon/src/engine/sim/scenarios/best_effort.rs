@@ -1,4 +1,5 @@
-//! BEST_EFFORT samples beyond a link's rate: as many whole samples arrive as the link carries, and they are fresh.
+//! Tests BEST_EFFORT samples beyond a link's rate: as many whole samples arrive as the link carries, and they are
+//! fresh.
 
 #![allow(clippy::print_stdout, reason = "a scenario prints its figures")]
 
@@ -13,7 +14,7 @@ use crate::engine::sim::{
     world::World,
 };
 
-/// A stream over a link of so many Mbit/s, at `load` times the link's rate.
+/// A stream over a link of `rate` Mbit/s, at `load` times the link's rate.
 struct Case {
     rate: u64,
     load: f64,
@@ -21,17 +22,17 @@ struct Case {
     depth: u32,
 }
 
-/// What arrived of it.
+/// The part of the stream that arrived.
 #[derive(Debug)]
 struct Arrived {
-    /// Samples, of those that the link could have carried.
+    /// The arrived samples as a share of those that the link could have carried.
     share: f64,
     median: Duration,
     oldest: Duration,
 }
 
 impl Case {
-    /// How long one sample takes at the link's rate.
+    /// Returns how long one sample takes at the link's rate.
     fn crossing(&self) -> Duration {
         Duration::from_secs_f64(self.length as f64 * 8.0 / (self.rate as f64 * 1e6))
     }
@@ -74,8 +75,8 @@ fn best_effort_beyond_the_rate_of_a_link_arrives_at_that_rate_and_fresh() {
                 println!("{name}: {arrived:.2?}");
                 // Headers take 4 %.
                 assert!(arrived.share > 0.85, "{name}: {arrived:?}");
-                // What takes longer than 200 ms is dropped for a newer one, but for the one that is on its way and the
-                // next.
+                // A newer sample replaces one that waits longer than 200 ms, except the sample in flight and the next
+                // one.
                 let most = 3 * case.crossing() + millis(200);
                 assert!(arrived.median < 2 * case.crossing() + millis(200), "{name}: {arrived:?}");
                 assert!(arrived.oldest < most, "{name}: {arrived:?}");

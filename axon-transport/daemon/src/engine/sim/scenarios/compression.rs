@@ -1,7 +1,7 @@
-//! Samples that become shorter: they cross a slow link faster, and nothing is lost or disordered for it. A fast link carries
-//! samples as they are.
+//! Tests compression: compressed samples cross a slow link faster, and none is lost or out of order. A fast link
+//! carries samples as they are.
 //!
-//! Samples of topics below `/text` become about a third as long, those of others do not become shorter.
+//! Samples of topics below `/text` become about a third as long, samples of other topics do not become shorter.
 
 #![allow(clippy::print_stdout, reason = "a scenario prints its figures")]
 
@@ -20,7 +20,7 @@ use crate::engine::sim::{
     world::World,
 };
 
-/// A stream of samples of this length over a link of so many Mbit/s, once it flows.
+/// Starts a stream of samples of `length` bytes over a link of `mbits` Mbit/s, and waits until it flows.
 fn stream(
     config: impl Fn(usize) -> Config,
     mbits: u64,
@@ -30,7 +30,7 @@ fn stream(
 ) -> (World, [Stream; 1]) {
     let mut world = World::new(90, 2, config);
     world.network.set_default_path(radio(mbits, 0.0));
-    // Twice what the link carries.
+    // The stream has twice the link's rate.
     let every = Duration::from_secs_f64(length as f64 * 4.0 / (mbits as f64 * 1e6));
     let mut streams = [Stream::new(&mut world, topic, qos, length, every)];
     world.until(secs(20), World::is_whole);
@@ -39,7 +39,8 @@ fn stream(
     (world, streams)
 }
 
-/// Of what the link carries uncompressed, how much the stream gets through in the next four seconds.
+/// Returns the rate of the stream in the next four seconds, as a share of the link's rate. The samples' uncompressed
+/// length counts.
 fn share(world: &mut World, streams: &mut [Stream; 1], mbits: u64) -> f64 {
     let before = streams[0].seen;
     drive(world, streams, secs(4));
@@ -47,7 +48,7 @@ fn share(world: &mut World, streams: &mut [Stream; 1], mbits: u64) -> f64 {
     bytes as f64 * 8.0 / 4.0 / (mbits as f64 * 1e6)
 }
 
-/// Samples that the first host had compressed.
+/// Returns the number of samples that the first host compressed.
 fn compressions(world: &World) -> u64 {
     world.hosts[0].compressions
 }
@@ -105,7 +106,7 @@ fn samples_that_are_replaced_while_they_are_compressed_arrive_nevertheless() {
         let before = streams[0].seen;
         drive(&mut world, &mut streams, secs(2));
         let seen = streams[0].seen - before;
-        // Three a second as they are, and more than twice as many when they are compressed.
+        // Three samples a second cross uncompressed, and more than twice as many compressed.
         assert!(seen > 12, "{qos:?}: {seen}");
     }
 }

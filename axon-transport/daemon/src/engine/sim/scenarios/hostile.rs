@@ -39,7 +39,7 @@ use crate::{
 pub(super) const LOWEST: DaemonId = DaemonId([0; 16]);
 pub(super) const HIGHEST: DaemonId = DaemonId([0xff; 16]);
 
-/// A world of so many honest hosts, all linked, and one raw peer.
+/// Creates a world of `hosts` honest hosts, all linked, and one raw peer.
 pub(super) fn world(seed: u64, hosts: usize, daemon: DaemonId) -> World {
     let mut world = World::new(seed, hosts, |_| Config::default());
     world.add_raw(Config::default(), daemon);
@@ -59,7 +59,7 @@ pub(super) fn dial(world: &mut World, host: usize) -> usize {
     dialled
 }
 
-/// Says HELLO, and waits for the other side's.
+/// Sends HELLO, and waits for the other side's.
 pub(super) fn greet(world: &mut World, of: usize, replaces: Option<[u8; 16]>) {
     world.with_raw(0, |raw, _| {
         let hello = LinkHello { replaces, ..raw.hello() };
@@ -89,14 +89,14 @@ pub(super) fn subscribe(route: u32, topic: &str, qos: Qos) -> LinkMessage {
     })
 }
 
-/// The GID of an endpoint of the raw peer.
+/// Returns the GID of an endpoint of the raw peer.
 pub(super) fn of_raw(number: u8) -> Gid {
     let mut gid = [number; 16];
     gid[..12].copy_from_slice(&FOREIGN);
     Gid(gid)
 }
 
-/// A graph of one publisher.
+/// Returns a graph of one publisher.
 pub(super) fn publishes(topic: &str, gid: Gid, qos: Qos) -> LinkMessage {
     let endpoint = Endpoint::new(gid, EndpointKind::Publisher, topic, "T")
         .with_qos(qos)
@@ -116,7 +116,7 @@ pub(super) fn asked(world: &mut World, on: usize, topic: &str) -> u32 {
     route(world).unwrap()
 }
 
-/// A data stream with some samples of a publisher.
+/// Returns a data stream with some samples of a publisher.
 pub(super) fn samples(
     route: u32,
     topic: &str,
@@ -126,7 +126,7 @@ pub(super) fn samples(
     messages(Kind::Topic, route, topic, (gid, gid), numbers)
 }
 
-/// A data stream with some samples, requests or responses: of a writer, and of the flow of an endpoint.
+/// Returns a data stream with some samples, requests or responses of a writer, in the flow of an endpoint.
 pub(super) fn messages(
     kind: Kind,
     route: u32,
@@ -236,7 +236,7 @@ fn a_best_effort_flow_goes_on_after_its_samples_ran_out_of_time() {
     };
     let mut world = World::new(22, 1, settings);
     world.add_raw(Config::default(), HIGHEST);
-    // The peer reads no stream: each stops after so many bytes.
+    // The peer reads no stream: each stops after `window` bytes.
     let window = 64 << 10;
     let mut transport = quinn_proto::TransportConfig::default();
     transport.stream_receive_window(VarInt::from_u32(window));
@@ -300,7 +300,7 @@ fn a_peer_of_another_protocol_version_is_refused_in_words_and_harms_nothing() {
         let shown = shown.unwrap_or_default();
         assert!(shown.contains("PROTOCOL_MISMATCH") && shown.contains(&range), "{shown}");
     }
-    // A later version that speaks ours, too, is a peer.
+    // A peer of a later version that also supports this one is accepted.
     let accepted = dial(&mut world, 0);
     world.with_raw(0, |raw, _| {
         let hello = LinkHello { protocol_max: 2, ..raw.hello() };
@@ -311,7 +311,7 @@ fn a_peer_of_another_protocol_version_is_refused_in_words_and_harms_nothing() {
     assert_eq!(world.received(pair), [1, 2, 3], "{}", world.describe());
 }
 
-/// A raw peer that publishes `/t`, and a subscription of a host to it.
+/// Creates a raw peer that publishes `/t`, and a subscription of a host to it.
 fn publisher(world: &mut World) -> (usize, Gid, u32) {
     let subscription = world.hosts[0].rings.create_subscription("/t", Qos::keep_all(), None);
     world.hosts[0].touch_graph();
@@ -323,7 +323,7 @@ fn publisher(world: &mut World) -> (usize, Gid, u32) {
     (on, subscription, route)
 }
 
-/// Samples that were refused since their numbers cannot be.
+/// Returns the number of samples that were refused for impossible numbers.
 fn refused_numbers(world: &World) -> u64 {
     world.hosts[0].lost.get(&("/t".to_owned(), "ring")).copied().unwrap_or(0)
 }

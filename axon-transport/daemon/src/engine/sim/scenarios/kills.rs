@@ -1,6 +1,6 @@
-//! A daemon that is killed at each boundary of a link's life: after each pass of dial, HELLO, proof, election, the
-//! hand-over to a successor with its drain, and an orderly end. A pass is all that one host does on one datagram,
-//! answer or timer; a rate on the path has the datagrams come one by one.
+//! Tests a daemon that is killed at each boundary of a link's life: after each pass of dial, HELLO, proof, election,
+//! the hand-over to a successor with its drain, and an orderly end. In a pass one host handles one datagram, answer or
+//! timer. A rate on the path separates the datagrams.
 
 #![allow(clippy::print_stdout, reason = "a scenario prints its figures")]
 
@@ -18,7 +18,7 @@ use crate::engine::sim::{
 
 /// Between two datagrams on the path, so that each is a pass of its own.
 const APART: Duration = Duration::from_micros(500);
-/// In a sample of the cases: one of so many.
+/// Divisor of the number of cases in a sample.
 const SAMPLE: u64 = 9;
 
 fn start(seed: u64, config: &dyn Fn(usize) -> Config) -> (World, Pair) {

@@ -24,7 +24,7 @@ fn seeds() -> std::ops::Range<u64> {
     first..first + setting("LONG_SEEDS", if all_cases() { 30 } else { 1 })
 }
 
-/// Two hosts, the first of which has so many publishers for the second.
+/// Creates two hosts, the first of which has `publishers` publishers for the second.
 fn pairs(seed: u64, publishers: usize) -> (World, Vec<Pair>) {
     let mut world = World::new(seed, 2, |_| Config::default());
     let rate = Rate::new(1_000_000_000, millis(20));
@@ -38,7 +38,7 @@ fn pairs(seed: u64, publishers: usize) -> (World, Vec<Pair>) {
     (world, pairs)
 }
 
-/// Whether all samples of these numbers came, in order.
+/// Returns whether the samples 1 to `samples` of each pair came, in order.
 fn have(world: &World, pairs: &[Pair], samples: u64) -> bool {
     pairs.iter().all(|pair| world.received(*pair).iter().copied().eq(1..=samples))
 }

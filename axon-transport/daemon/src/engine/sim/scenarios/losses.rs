@@ -1,4 +1,4 @@
-//! What is not delivered: what is passed over at the sender, and that each loss is counted once.
+//! Tests samples that are not delivered: samples that the sender passes over, and that each loss is counted once.
 
 use std::time::Duration;
 
@@ -10,7 +10,7 @@ use crate::engine::sim::{
     world::{Pair, World},
 };
 
-/// Two hosts and a publisher that is attached.
+/// Creates two hosts and a publisher that is attached.
 fn attached(seed: u64, qos: Qos, path: Path) -> (World, Pair) {
     let mut world = World::new(seed, 2, classic);
     world.network.set_default_path(path);
@@ -25,7 +25,7 @@ fn a_live_sample_behind_many_expired_ones_is_sent_without_another_ring() {
     for qos in [Qos::keep_all(), Qos::default().with_depth(256)] {
         let (mut world, pair) = attached(60, qos, Path::default());
         let (host, publisher) = pair.publisher;
-        // More than a take passes over, twice and a half.
+        // These are two and a half times as many samples as one take passes over.
         for _ in 0..160 {
             assert!(world.hosts[host].rings.publish(publisher, 10));
         }
@@ -37,7 +37,7 @@ fn a_live_sample_behind_many_expired_ones_is_sent_without_another_ring() {
     }
 }
 
-/// Samples of a topic that both hosts say are lost.
+/// Returns the number of samples of a topic that both hosts together report as lost.
 fn counted(world: &World, topic: &str) -> u64 {
     let lost = world.hosts.iter().flat_map(|host| &host.lost);
     lost.filter(|((of, _), _)| of == topic).map(|(_, samples)| samples).sum()
@@ -61,12 +61,12 @@ fn losses_of_one_relay_covered_by_another_are_not_counted() {
     };
     burst(&mut world);
     assert_eq!(world.received(pair).len(), 200);
-    // From now on the other relay is the one that asks for most.
+    // From now on the other relay is the most demanding one.
     world.hosts[subscriber].rings.end(subscription);
     world.hosts[subscriber].touch_graph();
     world.run_for(secs(2));
     assert_eq!(counted(&world, "/t"), 0, "{}", world.describe());
-    // What it loses itself counts, from the first sample.
+    // The losses of this relay count from the first sample.
     burst(&mut world);
     let came = world.hosts[subscriber].rings.received(last, publisher);
     let after = came.iter().filter(|number| **number > 200).count() as u64;
@@ -90,7 +90,7 @@ fn each_sample_that_does_not_arrive_is_counted_once() {
     ];
     for (seed, (qos, path, length)) in (61..).zip(all) {
         let (mut world, pair) = attached(seed, qos, path.clone());
-        // Three times what the path carries; small samples as fast as the clock of the test goes.
+        // The rate is three times that of the path. Small samples come as fast as the test's clock permits.
         let every = Duration::from_secs_f64(length as f64 / 6_000_000.0).max(millis(1));
         let end = world.now + secs(8);
         while world.now < end {
@@ -106,8 +106,8 @@ fn each_sample_that_does_not_arrive_is_counted_once() {
     }
 }
 
-/// A burst that the depth holds, published into a link that is cut for so long. `rings` says whether the engine hears of
-/// each sample or of the last alone. Returns the samples that arrived.
+/// Publishes a burst that fits the depth into a link that is cut for `cut`. `rings` says whether the engine is rung for
+/// each sample or only for the last one. Returns the number of samples that arrived.
 fn burst_into_a_cut(cut: Duration, rings: bool) -> (u64, u64) {
     let qos = Qos::default().with_depth(1024);
     let (mut world, pair) = attached(70, qos, Path { delay: millis(2), ..Path::default() });

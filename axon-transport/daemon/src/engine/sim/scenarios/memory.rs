@@ -1,4 +1,4 @@
-//! What peers have this host hold of messages that have not all come, and that honest ones go on all the same.
+//! Tests the memory that peers make this host hold for incomplete messages, and that honest peers still get through.
 
 use std::time::Duration;
 
@@ -26,13 +26,13 @@ use crate::{
     link::{GraphUpdate, LinkHello, LinkMessage, RouteReady, RouteSubscriber, Subscribe},
 };
 
-/// Publishers of one topic of the hostile peer: as many as one route shows.
+/// Publishers of one topic of the hostile peer: the maximum that one route shows.
 const PUBLISHERS: u32 = 1024;
-/// What comes of each message, and what its length says.
+/// Bytes of each message that arrive, and the length that the message states.
 const COMES: usize = 31 << 10;
 const SAYS: u32 = 32 << 10;
 
-/// A peer of this number dials under a daemon id. Returns its link once it is elected.
+/// Makes a raw peer dial under a daemon id. Returns its link once it is elected.
 pub(super) fn linked_as(world: &mut World, peer: usize, id: u8) -> usize {
     let to = world.hosts[0].address;
     let number = world.with_raw(peer, |raw, now| raw.dial(to, now));
@@ -45,7 +45,7 @@ pub(super) fn linked_as(world: &mut World, peer: usize, id: u8) -> usize {
     number
 }
 
-/// The GID of an endpoint that a daemon id announces.
+/// Returns the GID of an endpoint that a daemon id announces.
 pub(super) fn gid(id: u8, number: u32) -> Gid {
     let mut gid = [0; 16];
     gid[..12].copy_from_slice(&FOREIGN);
@@ -57,7 +57,7 @@ fn endpoint(kind: EndpointKind, gid: Gid, topic: &str) -> Endpoint {
     Endpoint::new(gid, kind, topic, "T").with_qos(Qos::keep_all()).with_node("node", "/")
 }
 
-/// Announces so many publishers of a topic.
+/// Announces `count` publishers of a topic.
 fn publishes(world: &mut World, link: usize, id: u8, topic: &str, count: u32) {
     let publisher = |n| endpoint(EndpointKind::Publisher, gid(id, n), topic);
     let added = (0..count).map(publisher).collect();
@@ -115,8 +115,8 @@ fn incomplete_short_messages_are_bounded_for_an_identity() {
     assert!(world.raws[0].links.iter().all(|link| link.closed.is_none()), "{}", world.describe());
 }
 
-/// A host with a reader that takes nothing, and a hand-driven peer that publishes for it: the world, the peer's link, and
-/// the route.
+/// Creates a host with a reader that takes nothing, and a raw peer that publishes for it. Returns the world, the peer's
+/// link, and the route.
 pub(super) fn raw_publishers(seed: u64, publishers: u32) -> (World, usize, u32) {
     let mut world = World::new(seed, 1, |_| Config::default());
     world.add_raw(Config::default(), DaemonId([0xff; 16]));
@@ -158,7 +158,8 @@ fn messages_that_become_long_and_wait_for_a_reader_are_bounded() {
     assert!(world.raws[0].links[number].closed.is_none(), "{}", world.describe());
 }
 
-/// So many publishers publish a message of this length at once. Whether all arrive.
+/// Checks that all messages arrive if `publishers` publishers publish a message of `length` bytes at once, `rounds`
+/// times.
 fn all_arrive(seed: u64, publishers: usize, length: usize, rounds: u64) {
     let mut world = World::new(seed, 2, |_| Config::default());
     let rate = Rate::new(1_000_000_000, millis(20));
@@ -234,7 +235,7 @@ fn publishers_of_a_topic_are_bounded_over_all_ids_of_an_identity() {
         world.run_for(secs(2));
     }
     assert_eq!(world.hosts[0].shown(), 1024, "{}", world.describe());
-    // Those of one id that leaves make room for others.
+    // Publishers of an id that leaves make room for others.
     world.with_raw(0, |raw, now| raw.close(0, now));
     world.run_for(secs(2));
     world.hosts[0].touch_graph();
@@ -243,7 +244,7 @@ fn publishers_of_a_topic_are_bounded_over_all_ids_of_an_identity() {
     assert_eq!(world.hosts[0].shown(), 1024, "{}", world.describe());
 }
 
-/// The daemon of a peer is killed that had KEEP_ALL relays for so many topics, and the next one says so.
+/// A raw peer with KEEP_ALL relays for `topics` topics is killed, and its next daemon announces the same subscription.
 fn restarts(world: &mut World, peer: usize, id: u8, topics: u32) {
     let subscription = endpoint(EndpointKind::Subscription, gid(id, 0), "/moved");
     let graph = GraphUpdate { version: 1, added: vec![subscription], ..GraphUpdate::default() };
@@ -295,7 +296,8 @@ fn subscribe_in_many_ways(world: &mut World, peer: usize, link: usize, id: u8, r
     world.with_raw(peer, |raw, _| raw.links[link].say(&message));
 }
 
-/// Routes of which a peer was told that some of its subscriptions get nothing for want of lanes.
+/// Returns the routes of which the host told a peer that some of its subscriptions get nothing because there are no
+/// lanes left.
 fn without_lanes(world: &World, peer: usize, link: usize) -> Vec<u32> {
     let refused =
         world.raws[peer].links[link].messages.iter().filter_map(|message| match message {
@@ -346,7 +348,7 @@ fn no_identity_takes_all_lanes_and_each_is_told_its_refused_routes() {
     assert_eq!(without_lanes(&world, 0, greedy), [20, 0]);
     assert_eq!(without_lanes(&world, 1, other), Vec::<u32>::new());
 
-    // What it leaves is there again.
+    // The lanes that the peer leaves are free again.
     world.with_raw(0, |raw, now| raw.close(greedy, now));
     world.run_for(secs(2));
     assert_eq!(world.hosts[0].rings.lanes(), other_has, "{}", world.describe());
@@ -398,7 +400,7 @@ fn kept_relay_stays_charged_until_its_end() {
     world.run_for(secs(3));
     assert_eq!(without_lanes(&world, 0, next), [21]);
     assert_eq!(world.hosts[0].kept(), 1, "{}", world.describe());
-    // What it has is nobody else's.
+    // Another daemon cannot use the lanes of the kept relay.
     let relays = world.hosts[0].rings.relays();
     subscribe_in_many_ways(&mut world, 0, other, 0xf4, 20);
     world.run_for(secs(1));

@@ -1,8 +1,8 @@
-//! Addresses that change under a link: a NAT that rebinds, a host that gets another address.
+//! Tests address changes under a link: a NAT rebinds, or a host gets another address.
 //!
 //! quinn-proto 0.11.19 has a debug assertion that fails when the loss timer of a server expires after the client's
 //! address changed: the new path has nothing in flight, and the timer is the old path's. Without debug assertions it
-//! sends one probe. So these run in release alone: `cargo xtask simulate --scenarios`.
+//! sends one probe. So these tests run only in release: `cargo xtask simulate --scenarios`.
 
 #![allow(clippy::print_stdout, reason = "a scenario prints its figures")]
 
@@ -62,7 +62,7 @@ impl Moving {
         }
     }
 
-    /// Publishes a sample in each direction, for each of so many milliseconds.
+    /// Publishes a sample in each direction every millisecond, for `milliseconds`.
     fn publish_each(&mut self, milliseconds: u64) {
         for _ in 0..milliseconds {
             self.publish_one();
@@ -75,7 +75,7 @@ impl Moving {
         refusals.filter(|(_, text)| text.starts_with("down")).count()
     }
 
-    /// All that was published arrives, in order and once.
+    /// Checks that all published samples arrive, in order and once.
     fn is_complete(&mut self, case: &str) {
         self.world.run_for(secs(10));
         for (pair, published) in self.pairs.iter().zip(self.published) {
@@ -156,7 +156,7 @@ fn two_hosts_that_get_other_addresses_at_once_flow_again_soon_and_lose_nothing()
         let mut moving = Moving::new(43, &config, None);
         for _ in 0..3 {
             (0..2).for_each(|host| moving.world.move_host(host));
-            // Neither knows where to probe: the beacons of the other one say it.
+            // Neither host knows where to probe until the other's beacons give the new address.
             moving.publish(secs(10));
         }
         moving.is_complete(mode);
@@ -170,8 +170,8 @@ fn an_endpoint_that_ends_while_its_daemons_predecessor_is_not_given_up_leaves_no
     let mut world = World::new(44, 2, crate::engine::sim::tests::classic);
     let pair = world.pair(0, 1, "/out", Qos::keep_all());
     world.until(secs(20), World::is_whole);
-    // Nobody is at the old address who could say that the daemon is gone, and in `none` the address decides whose
-    // endpoints they are.
+    // No process at the old address can answer that the daemon is gone, and in `none` the address identifies the owner
+    // of endpoints.
     world.move_host(1);
     world.kill(1, false);
     world.restart(1);

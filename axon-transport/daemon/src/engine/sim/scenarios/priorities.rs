@@ -1,4 +1,4 @@
-//! `[[topic]] priority`: what goes first over a link that cannot carry all.
+//! Tests `[[topic]] priority`: the order over a link that cannot carry all samples.
 
 #![allow(clippy::print_stdout, reason = "a scenario prints its figures")]
 
@@ -10,7 +10,7 @@ use axon_transport::config::{Config, TopicPattern, TopicPriority, TopicRule};
 use super::radio::{Stream, drive, radio, secs};
 use crate::engine::sim::world::World;
 
-/// Two hosts over so many Mbit/s, where topics below `/high` and `/low` have that priority.
+/// Creates two hosts over `mbits` Mbit/s, where topics below `/high` and `/low` have that priority.
 fn hosts(mbits: u64) -> World {
     let mut world = World::new(22, 2, |_| {
         let mut config = Config::default();
@@ -24,7 +24,7 @@ fn hosts(mbits: u64) -> World {
     world
 }
 
-/// Has each stream begin, as soon as both hosts know it.
+/// Waits until both hosts know each stream, and a second more.
 fn ready(world: &mut World) {
     world.until(secs(20), World::is_whole);
     world.run_for(secs(1));

@@ -16,13 +16,13 @@ pub(super) fn secs(seconds: u64) -> Duration {
     Duration::from_secs(seconds)
 }
 
-/// A radio link of so many Mbit/s: a round trip of 3 ms, a queue of 40 ms, and this loss both ways.
+/// Returns a radio link of `mbits` Mbit/s, with a round trip of 3 ms, a queue of 40 ms, and the loss `loss` both ways.
 pub(super) fn radio(mbits: u64, loss: f64) -> Path {
     let rate = Rate::new(mbits * 1_000_000 / 8, Duration::from_millis(40));
     Path { delay: Duration::from_micros(1_500), rate: Some(rate), loss, ..Path::default() }
 }
 
-/// The same, but packets are lost in bursts of so many on average (Gilbert's model).
+/// Returns the same link with losses in bursts of `packets` packets on average (Gilbert's model).
 fn bursts(mbits: u64, loss: f64, packets: f64) -> Path {
     let bad_to_good = 1.0 / packets;
     let good_to_bad = bad_to_good * loss / (1.0 - loss);
@@ -30,12 +30,12 @@ fn bursts(mbits: u64, loss: f64, packets: f64) -> Path {
     Path { burst_loss, ..radio(mbits, 0.0) }
 }
 
-/// Two linked hosts with this controller.
+/// Creates two linked hosts with this controller.
 fn hosts(congestion: Congestion, path: Path) -> World {
     hosts_of(21, congestion, path)
 }
 
-/// The same, by the random numbers of this seed.
+/// Creates the same hosts, with the random numbers of this seed.
 fn hosts_of(seed: u64, congestion: Congestion, path: Path) -> World {
     let mut world = World::new(seed, 2, move |_| {
         let mut config = Config::default();
@@ -71,12 +71,12 @@ impl Stream {
         Self { pair, length, every, next: Duration::ZERO, published, seen: 0, arrived }
     }
 
-    /// Samples that were published.
+    /// Returns the number of published samples.
     pub(super) fn published(&self) -> usize {
         self.published.len()
     }
 
-    /// The ages of what arrived from `from` on, in order.
+    /// Returns the sorted ages of the samples that arrived from `from` on.
     pub(super) fn ages(&self, from: Duration) -> Vec<Duration> {
         let arrived = self.arrived.iter().filter(|(at, _)| *at >= from);
         let mut ages: Vec<_> = arrived.map(|(_, age)| *age).collect();
@@ -110,7 +110,7 @@ pub(super) fn drive(world: &mut World, streams: &mut [Stream], time: Duration) {
     }
 }
 
-/// A stream without a rate of its own, as soon as both hosts know it.
+/// Starts a stream without a rate of its own, as soon as both hosts know it.
 fn flood(world: &mut World) -> [Stream; 1] {
     let every = Duration::from_millis(1);
     let stream = Stream::new(world, "/log", Qos::keep_all(), 16 << 10, every);
@@ -119,7 +119,7 @@ fn flood(world: &mut World) -> [Stream; 1] {
     [stream]
 }
 
-/// The share of 54 Mbit/s that a stream gets through in the next four seconds.
+/// Returns the share of 54 Mbit/s that a stream gets through in the next four seconds.
 fn share(world: &mut World, streams: &mut [Stream; 1]) -> f64 {
     let before = streams[0].seen;
     drive(world, streams, secs(4));
@@ -127,7 +127,7 @@ fn share(world: &mut World, streams: &mut [Stream; 1]) -> f64 {
     bytes as f64 * 8.0 / 4.0 / 54e6
 }
 
-/// The share of 54 Mbit/s that a stream without a rate of its own gets through.
+/// Returns the share of 54 Mbit/s that a stream without a rate of its own gets through.
 fn goodput(congestion: Congestion, path: Path) -> f64 {
     goodput_of(hosts(congestion, path))
 }
@@ -251,12 +251,12 @@ struct Row {
     name: &'static str,
     qos: Qos,
     length: usize,
-    /// The ages in ms at which the share is told.
+    /// The limits of age in ms for which the share is reported.
     within: [u64; 2],
 }
 
-/// Samples at 30 Hz for some seconds over a path: the share that is not older than each of `within` when
-/// it arrives, the share that arrives at all, and the median age.
+/// Publishes samples at 30 Hz for `time` over a path. Returns the share that is not older than each of `within` when it
+/// arrives, the share that arrives at all, and the median age.
 fn shares(row: &Row, path: Path, time: Duration) -> ([f64; 2], f64, Duration) {
     let mut world = hosts(Congestion::Auto, path);
     let every = Duration::from_micros(33_333);
@@ -349,8 +349,8 @@ fn saturating_publishers_share_a_link_equally_at_any_sample_size() {
     assert!(shares.iter().all(|share| (0.23..0.45).contains(share)), "{shares:?}");
 }
 
-/// Bursts of three best-effort samples of 4 MB over a link that is idle otherwise: each sample takes 0.6 s to cross. The
-/// numbers of those that arrive.
+/// Publishes bursts of three best-effort samples of 4 MB over a link that is idle otherwise, on which each sample takes
+/// 0.6 s. Returns the numbers of the samples that arrive.
 fn bursts_of_images(lifespan: Option<Duration>) -> Vec<u64> {
     let mut world = hosts(Congestion::Auto, radio(54, 0.0));
     let qos = Qos::sensor_data().with_depth(8).with_lifespan(lifespan);
@@ -385,7 +385,7 @@ fn a_best_effort_sample_that_takes_long_crosses_an_idle_link() {
 
 #[test]
 fn best_effort_samples_may_be_as_old_as_their_lifespan() {
-    // Once it is known how long a sample takes, none but the newest of a burst comes within 200 ms.
+    // Once the engine knows how long a sample takes, only the newest of a burst can arrive within 200 ms.
     assert_eq!(bursts_of_images(None), [1, 2, 3, 4, 6]);
     assert_eq!(bursts_of_images(Some(secs(10))), [1, 2, 3, 4, 5, 6]);
 }

@@ -1,4 +1,4 @@
-//! Routes that one host refuses: both say so, and why.
+//! Tests routes that one host refuses: both hosts report it, with the reason.
 
 use axon_shm::qos::Qos;
 use axon_transport::config::Config;
@@ -8,7 +8,7 @@ use crate::engine::sim::{
     world::{Pair, World},
 };
 
-/// Two hosts and a topic. One of them can open nothing.
+/// Creates two hosts and a topic. Host `fails` can open neither relays nor stand-ins.
 fn world(fails: usize) -> (World, Pair) {
     let mut world = World::new(90, 2, |_| Config::default());
     world.hosts[fails].rings.set_fails(true);
@@ -18,7 +18,7 @@ fn world(fails: usize) -> (World, Pair) {
     (world, pair)
 }
 
-/// Why the topic does not cross, as each host says.
+/// Returns the reasons why the topic does not cross, as each host reports them.
 fn refused(world: &World) -> [Vec<String>; 2] {
     [0, 1].map(|host| {
         let links = world.hosts[host].status.values();

@@ -13,11 +13,11 @@ use crate::engine::sim::{
 
 /// Links of a daemon at a time.
 const MAX_LINKS: usize = 160;
-/// What a host may send until the graph is whole: for each other host, in bytes and datagrams. A link costs two
-/// handshakes at most, since both hosts may dial, and the graph of 20 topics.
+/// Budget of a host until the graph is whole, for each other host: bytes and datagrams. It covers two handshakes, since
+/// both hosts may dial, and the graph of 20 topics.
 const BUDGET: (u64, u64) = (24_000, 40);
 
-/// Each host has so many topics.
+/// Creates `topics` topics on each host.
 fn with_topics(world: &World, topics: usize) {
     for (host, number) in world.hosts.iter().zip(0..) {
         for topic in 0..topics {
@@ -35,7 +35,7 @@ fn within(world: &mut World, most: Duration, holds: impl Fn(&World) -> bool) {
     }
 }
 
-/// What the host that sent most sent: bytes and datagrams.
+/// Returns the maximum that one host sent: bytes and datagrams.
 fn most_sent(world: &World) -> (u64, u64) {
     let counters = (0..world.hosts.len()).map(|host| world.network.counters(host));
     counters.fold((0, 0), |most, c| (most.0.max(c.sent_bytes), most.1.max(c.sent)))
@@ -83,7 +83,7 @@ fn hosts_beyond_the_links_of_a_daemon_are_refused_and_harm_no_link() {
     }
     let (bytes, datagrams) = most_sent(&world);
     println!("{beyond} hosts too many: at most {bytes} bytes in {datagrams} datagrams sent by one");
-    // A link that ends makes place for one of those.
+    // A link that ends makes room for a link with one of the remaining hosts.
     world.kill(1, true);
     let place = |world: &World| {
         world.hosts[MAX_LINKS + 1..].iter().filter(|host| !host.linked().is_empty()).count()

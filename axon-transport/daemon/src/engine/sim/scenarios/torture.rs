@@ -1,5 +1,5 @@
-//! A peer that says anything in any state, by chance: messages of all types before their time, twice, altered and cut off;
-//! streams of routes and publishers that are not its own; closes and resets. Honest hosts are linked meanwhile.
+//! Tests a peer that sends anything in any state, by chance: messages of all types too early, twice, altered and cut
+//! off; streams of routes and publishers that are not its own; closes and resets. Honest hosts are linked meanwhile.
 
 use axon_shm::{ids::Gid, qos::Qos};
 use axon_transport::config::Config;
@@ -31,10 +31,10 @@ struct Torture {
     world: World,
     /// Samples go from one honest host to the other.
     pair: Pair,
-    /// GIDs that the peer may name: its own, and those of others.
+    /// GIDs that the peer may name: its own, and those of other hosts.
     gids: Vec<Gid>,
     streams: Vec<(usize, StreamId)>,
-    /// What was said last, to be said again.
+    /// The last frame, which may be sent again.
     last: Bytes,
 }
 
@@ -69,13 +69,13 @@ impl Torture {
         self.gids[self.rng.random_range(0..self.gids.len())]
     }
 
-    /// A number that a test of bounds would choose.
+    /// Returns a number that a test of bounds would choose.
     fn number(&mut self) -> u64 {
         let some = [0, 1, 2, 3, 7, 1024, u64::from(u32::MAX), u64::MAX - 1, u64::MAX];
         some[self.rng.random_range(0..some.len())]
     }
 
-    /// Any message, with numbers and GIDs that mean something here.
+    /// Returns any message, with numbers and GIDs that exist here.
     fn message(&mut self) -> LinkMessage {
         let mut all = samples::messages();
         let mut message = all.swap_remove(self.rng.random_range(0..all.len()));
@@ -101,7 +101,7 @@ impl Torture {
                 m.more = self.rng.random_bool(0.2);
                 m.removed = vec![gid];
                 let host = self.rng.random_range(0..2);
-                // Those of others are not its own.
+                // The peer also announces endpoints of other hosts as its own.
                 let endpoints = self.world.hosts[host].rings.endpoints();
                 for endpoint in endpoints.iter().take(self.rng.random_range(0..4)) {
                     let mut endpoint = (**endpoint).clone();
@@ -141,7 +141,7 @@ impl Torture {
         message
     }
 
-    /// The frame of a message, whole or altered.
+    /// Returns the frame of a message, whole or altered.
     fn frame(&mut self) -> Bytes {
         let mut frame = self.message().to_frame().unwrap();
         match self.rng.random_range(0..8) {
@@ -162,7 +162,7 @@ impl Torture {
         frame.into()
     }
 
-    /// What a data stream may begin with.
+    /// Returns the possible beginning of a data stream.
     fn data(&mut self) -> Bytes {
         let header = StreamHeader {
             of: self.gid(),
@@ -263,7 +263,7 @@ impl Torture {
         let received = self.world.received(self.pair);
         assert_eq!(received, expected, "seed {seed}: {}", self.world.describe());
         for link in &self.world.raws[0].links {
-            // What ends a link has a name, and is no defect of the host.
+            // The end of a link has a close code, and is no defect of the host.
             if let Some((code, text)) = &link.closed {
                 assert_ne!(*code, Some(CloseCode::Internal), "seed {seed}: {text}");
                 assert!(code.is_some() || !text.contains("closed by peer"), "seed {seed}: {text}");

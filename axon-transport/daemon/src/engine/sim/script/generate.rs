@@ -21,7 +21,7 @@ pub(crate) struct Recipe {
     pub(crate) weights: Weights,
 }
 
-/// How often each kind of fault is drawn, in proportion. At 0 it is not.
+/// The relative frequency of each kind of fault. A kind with weight 0 is not drawn.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Weights {
     pub(crate) partition: u32,
@@ -185,7 +185,7 @@ impl Recipe {
     fn path(&self, rng: &mut SimRng) -> Kind {
         let [from, to] = self.two_hosts(rng);
         let mut change = PathChange { delay: tenths(rng, 0..2_000), ..PathChange::default() };
-        // Not all impairments at once: each alone finds more.
+        // A fault does not combine all impairments: single ones find more.
         if rng.random_bool(0.5) {
             change.loss = any(rng, &[1, 10, 50, 200, 400, 1_000]);
         }

@@ -37,13 +37,13 @@ pub(crate) struct Fault {
     pub(crate) kind: Kind,
 }
 
-/// Kind of a fault. The run ignores a fault that does not apply, such as a burst of samples without a
+/// The kind of a fault. The run ignores a fault that does not apply, for example a burst of samples without a
 /// publisher.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Kind {
-    /// The hosts and all others do not hear each other.
+    /// No packet passes between the hosts and all others.
     Partition { hosts: Vec<usize> },
-    /// `to` does not hear `from`.
+    /// No packet passes from `from` to `to`.
     Cut { from: usize, to: usize },
     /// The daemon ends: at once, or `orderly` as after SIGTERM. At the fault's end it starts again.
     Kill { host: usize, orderly: bool },
@@ -79,7 +79,7 @@ pub(crate) struct PathChange {
     pub(crate) rate: Option<u64>,
 }
 
-/// How a KME fails.
+/// The kind of a KME's failure.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum KmeFailure {
     /// Connections to it are refused.
@@ -109,7 +109,7 @@ pub(crate) enum Qos {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Step {
     pub(crate) at: Duration,
-    /// Its index in the script.
+    /// The fault's index in the script.
     pub(crate) fault: usize,
     pub(crate) edge: Edge,
 }

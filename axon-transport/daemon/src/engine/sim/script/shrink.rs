@@ -8,7 +8,7 @@ use super::{Fault, Kind, PathChange, Script};
 #[derive(Clone, Debug)]
 pub(crate) struct Shrunk {
     pub(crate) script: Script,
-    /// How often `fails` was called.
+    /// The number of calls of `fails`.
     pub(crate) runs: usize,
     /// Whether the limit of runs was reached first. Otherwise no fault can be deleted and none made simpler
     /// by one step.
@@ -64,7 +64,7 @@ impl<F: FnMut(&Script) -> bool> Search<F> {
         let mut size = self.best.faults.len();
         while size > 0 && !self.is_over() {
             let mut deleted = false;
-            // From the end: what happens late is least likely to be a condition of what happens early.
+            // The search goes from the end: late faults are least likely to be a condition of early ones.
             let mut end = self.best.faults.len();
             while end > 0 {
                 let start = end.saturating_sub(size);
@@ -73,7 +73,7 @@ impl<F: FnMut(&Script) -> bool> Search<F> {
                 deleted |= self.try_script(candidate);
                 end = start;
             }
-            // Once no single fault can go, nothing is left to be tried.
+            // Once no single fault can be deleted, the search is over.
             if size > 1 || !deleted {
                 size /= 2;
             }

@@ -19,7 +19,7 @@ fn recipe() -> Recipe {
     }
 }
 
-/// The name that a fault's kind has in text.
+/// Returns the name that a fault's kind has in text.
 fn name(fault: &Fault) -> String {
     fault.kind.to_string().split(' ').next().unwrap().to_owned()
 }
@@ -195,7 +195,7 @@ fn steps_are_in_order() {
     assert_eq!(Script { faults: vec![], ..script }.end(), ms(0));
 }
 
-/// Says whether `script` has these faults, in any order, with any others between them.
+/// Returns whether `script` has these faults, in any order, with any others between them.
 fn has(script: &Script, wanted: &[&dyn Fn(&Fault) -> bool]) -> bool {
     wanted.iter().all(|wanted| script.faults.iter().any(wanted))
 }

@@ -11,7 +11,7 @@ fn ms(ms: u64) -> Duration {
     Duration::from_millis(ms)
 }
 
-/// The first address of a host in [`network`].
+/// Returns the first address of a host in [`network`].
 fn ip(host: usize) -> Ipv4Addr {
     Ipv4Addr::new(10, 0, (host / 250) as u8, (host % 250) as u8 + 1)
 }

@@ -79,7 +79,7 @@ fn burst_loss_comes_in_bursts() {
 
 #[test]
 fn rate_holds_within_a_packet() {
-    // 1,000 bytes and their headers every 1,028 us, whatever the bursts.
+    // The path carries 1,000 bytes and their headers every 1,028 us, independent of the bursts.
     let rate = Some(Rate::new(1_000_000, Duration::from_secs(10)));
     let mut network = network(7, 2);
     network.set_default_path(Path { rate, delay: ms(5), ..Path::default() });

@@ -34,7 +34,7 @@ fn path(rng: &mut impl RngExt) -> Path {
     }
 }
 
-/// Runs random traffic through random faults. Each datagram's bytes say who sent it to whom.
+/// Runs random traffic through random faults. Each datagram contains its sender and its receiver.
 fn run(seed: u64, calls: usize) -> Trace {
     let mut network = network(seed, HOSTS);
     let nat = network.add_nat([203, 0, 113, 1].into(), Filtering::AddressAndPortDependent, None);

@@ -108,7 +108,7 @@ fn interfaces_of_one_host_have_their_own_paths() {
 
 const OUTER: Ipv4Addr = Ipv4Addr::new(203, 0, 113, 1);
 
-/// Host 0 is public; hosts 1 and 2 are behind one NAT.
+/// Creates a network in which host 0 is public, and hosts 1 and 2 are behind one NAT.
 fn behind_nat(filtering: Filtering, lifetime: Option<Duration>) -> (Network, NatId) {
     let mut network = network(1, 3);
     let nat = network.add_nat(OUTER, filtering, lifetime);

@@ -17,15 +17,15 @@ use crate::engine::sim::{
 
 /// Samples flow again this long after a path's return, at the latest.
 const BACK: Duration = Duration::from_millis(500);
-/// The same after a cut of one way: the host that hears the other notices the cut late.
+/// The same limit after a cut of one direction: the host that still hears the other notices the cut late.
 const BACK_FROM_ONE_WAY: Duration = Duration::from_millis(1000);
 
-/// What the publishers of a host publish.
+/// The load of a host's publishers.
 #[derive(Clone, Copy, Debug)]
 enum Load {
-    /// So few that a cut of a minute fits the history.
+    /// So few samples that the history can hold those of a one-minute cut.
     Few,
-    /// So many that the congestion window is full, and during a cut the history.
+    /// So many samples that the congestion window is full, and during a cut also the history.
     Many,
 }
 
@@ -74,7 +74,7 @@ impl Cut {
         Self { world, pairs, published: [0; 2], load }
     }
 
-    /// Has these publishers publish for so long.
+    /// Makes these publishers publish for `time`.
     fn publish(&mut self, who: &[usize], time: Duration) {
         let end = self.world.now + time;
         while self.world.now < end {
@@ -94,7 +94,7 @@ impl Cut {
         }
     }
 
-    /// Runs until a sample of each of these publishers came, and says how long that took.
+    /// Runs until a sample of each of these publishers arrives, and returns how long that took.
     fn flows(&mut self, who: &[usize]) -> Duration {
         let (began, pairs) = (self.world.now, self.pairs);
         let before = pairs.map(|pair| self.world.received(pair).len());
@@ -104,13 +104,13 @@ impl Cut {
         self.world.now - began
     }
 
-    /// How often a host lost the link, or took the other one for gone.
+    /// Returns how often a host lost the link, or took the other one for gone.
     fn flaps(&self) -> usize {
         let refusals = self.world.hosts.iter().flat_map(|host| &host.refusals);
         refusals.filter(|(_, text)| text.starts_with("down") || text == "silent").count()
     }
 
-    /// All that was published arrived, once and in order.
+    /// Checks that all published samples arrived, once and in order.
     fn is_complete(&mut self, case: &str) {
         self.world.run_for(secs(5));
         assert!(self.world.is_whole(), "{case}: {}", self.world.describe());
@@ -128,7 +128,7 @@ fn flows_again_after(cut: Duration, load: Load, ways: Ways) {
     flows_again_with(cut, load, ways, |_| {});
 }
 
-/// As [`flows_again_after`], with other settings of the hosts.
+/// Runs [`flows_again_after`] with other settings of the hosts.
 fn flows_again_with(cut: Duration, load: Load, ways: Ways, set: fn(&mut Config)) {
     let instants: &[u64] = if all_cases() { &[0, 130, 370, 610, 890] } else { &[370] };
     for (mode, config) in modes() {
@@ -138,7 +138,7 @@ fn flows_again_with(cut: Duration, load: Load, ways: Ways, set: fn(&mut Config))
             config
         });
         for who in [&[][..], &[0], &[1], &[0, 1]] {
-            // What goes the other way arrives meanwhile.
+            // Samples in the other direction arrive meanwhile.
             let (awaited, most) = match ways {
                 Ways::Both => (who, BACK),
                 Ways::From(0) => (&[0][..], BACK_FROM_ONE_WAY),
@@ -196,7 +196,7 @@ fn after_a_cut_of_20_s_samples_flow_within_half_a_second_and_none_is_lost() {
 #[test]
 fn after_a_cut_of_60_s_samples_flow_within_half_a_second_and_none_is_lost() {
     flows_again_after(secs(60), Load::Few, Ways::Both);
-    // By default a host that is gone holds no publisher up for longer than this cut.
+    // With the default limit a host that is gone would hold up a publisher for less time than this cut takes.
     flows_again_with(secs(60), Load::Many, Ways::Both, |config| config.link.stalled = secs(60));
 }
 
@@ -228,7 +228,7 @@ fn after_several_short_returns_samples_flow_within_half_a_second_of_the_last_and
 
 #[test]
 fn after_a_cut_of_one_way_samples_flow_within_a_second_and_none_is_lost() {
-    // After longer ones a route counts as one that is not read: the other host is heard.
+    // After a longer cut the route counts as unread, because the other host is still heard.
     for from in [0, 1] {
         flows_again_after(secs(5), Load::Few, Ways::From(from));
         flows_again_after(secs(5), Load::Many, Ways::From(from));

@@ -72,7 +72,7 @@ impl TwoPaths {
         Self::over(seed, config, Path { delay: millis(2), ..Path::default() })
     }
 
-    /// Links two hosts over a first path of this quality.
+    /// Returns links two hosts over a first path of this quality.
     fn over(seed: u64, config: impl Fn(usize) -> Config, first: Path) -> Self {
         let mut world = World::new(seed, 2, config);
         world.network.set_default_path(Path { delay: millis(2), ..Path::default() });
@@ -150,7 +150,7 @@ impl TwoPaths {
         ages[((ages.len() - 1) as f64 * share) as usize]
     }
 
-    /// Everything arrives, once and in order, and no host took the other one for gone.
+    /// Checks that everything arrives, once and in order, and that no host took the other one for gone.
     fn is_complete(&mut self, case: &str) {
         self.world.run_for(secs(5));
         for (pair, published) in self.pairs.iter().zip(self.published) {
@@ -474,7 +474,7 @@ fn hosts_that_shut_down_with_a_second_link_do_not_spin() {
 fn successor_over_the_path_of_the_second_link_ends_that_link() {
     let (mode, config) = modes().remove(0);
     let mut paths = TwoPaths::new(71, &config);
-    // Host 1 is heard at its second address alone, and both hosts look for each other there.
+    // The beacons of host 1 come only from its second address, and both hosts probe each other there.
     let daemon = paths.world.hosts[1].daemon;
     paths.world.hosts[0].moved(daemon, paths.addresses[1]);
     paths.set_path(0, false);

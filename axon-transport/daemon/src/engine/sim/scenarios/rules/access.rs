@@ -1,4 +1,4 @@
-//! Access rules between hosts: what either side denies does not cross, whatever the other side does.
+//! Tests access rules between hosts: denied data does not cross, whichever side denies it.
 
 use axon_shm::{
     ids::{DaemonId, Gid},
@@ -32,7 +32,7 @@ fn rules(text: &str) -> AccessRules {
     AccessRules::parse(text, "access.toml").unwrap()
 }
 
-/// Two hosts, of which one has these rules.
+/// Creates two hosts, one of which has these rules.
 pub(super) fn hosts(with_rules: usize, text: &str) -> World {
     World::new(23, 2, |host| {
         let mut config = Config::default();
@@ -47,12 +47,12 @@ pub(super) fn link(world: &World, host: usize) -> &LinkStatus {
     world.hosts[host].status.values().next().unwrap()
 }
 
-/// What a host shows as denied, as one text.
+/// Returns the denials that a host's status shows, as one text.
 pub(super) fn denied(world: &World, host: usize) -> String {
     format!("{:?}", link(world, host).denied)
 }
 
-/// Whether a host was told of an endpoint of the other one.
+/// Returns whether a host knows an endpoint of the other one.
 fn is_shown(world: &World, host: usize, (_, gid): (usize, Gid)) -> bool {
     world.hosts[host].graph.values().any(|all| all.contains_key(&gid))
 }
@@ -93,7 +93,8 @@ fn a_topic_does_not_cross_where_either_host_denies_it() {
         assert!(is_shown(&world, 1, right.publisher) && is_shown(&world, 0, right.subscription));
         let hidden = if with_rules == 1 { (1, wrong.publisher) } else { (0, wrong.subscription) };
         assert!(!is_shown(&world, hidden.0, hidden.1), "{text}");
-        // What a peer may not do and may not see is not in its graph either; a [[deny]] alone leaves it to be seen.
+        // An endpoint that the peer may neither use nor see is not in its graph either. A [[deny]] alone leaves the
+        // endpoint visible.
         let other_end = [wrong.publisher, wrong.subscription][with_rules];
         assert_eq!(is_shown(&world, 1 - with_rules, other_end), !text.contains("allow"), "{text}");
         world.run_for(secs(2));
@@ -134,7 +135,7 @@ fn an_endpoint_that_may_be_seen_and_not_used_has_no_stand_in() {
     for closed in ["[[deny]]\npeer = \"*\"\nsubscribe = \"/scan\"", see] {
         let mut world = hosts(0, closed);
         let scan = world.pair(0, 1, "/scan", latched());
-        // From before they are linked: it is not there for a moment either.
+        // The check begins before the hosts are linked: the endpoint must never appear, not even for a moment.
         for _ in 0..3000 {
             world.run_for(millis(1));
             assert_eq!(world.hosts[1].shown(), 0, "{closed}");
@@ -166,7 +167,7 @@ fn denying_see_also_denies_topics_without_an_allow_and_reports_the_rule() {
         world.run_for(secs(1));
         assert!(arrives(&mut world, scan), "{text}");
         assert!(is_shown(&world, 1, scan.publisher) && !is_shown(&world, 1, odom.publisher));
-        // Where no [[allow]] names the peer, what is hidden from it is denied to it.
+        // If no [[allow]] names the peer, hidden endpoints are also denied to it.
         for (with_rules, verb) in [(0, "subscribe"), (1, "publish")] {
             let mut world = hosts(with_rules, &see);
             let scan = world.pair(0, 1, "/scan", latched());
@@ -249,7 +250,7 @@ fn a_peer_that_ignores_rules_receives_and_delivers_nothing() {
     let subscription = world.hosts[0].rings.create_subscription("/in", qos, None);
     world.hosts[0].touch_graph();
     world.hosts[0].rings.publish(publisher, 10);
-    // Whole it does not become: host 1 is not shown all.
+    // The world does not become whole, because host 1 does not see all endpoints.
     world.until(secs(10), World::is_linked);
     let on = dial(&mut world, 0);
     greet(&mut world, on, None);
@@ -322,11 +323,11 @@ fn rules_are_looked_at_for_endpoints_and_never_for_a_sample() {
     world.run_for(secs(2));
     assert_eq!(looks_at_rules(), matched, "for {} samples", 500 * pairs.len());
     assert!(pairs.iter().all(|pair| world.received(*pair).len() > 400));
-    // Of many endpoints, most of them denied, one more has itself alone checked, and its route.
+    // One more endpoint beside many, most of them denied, causes only its own check and that of its route.
     for number in 0..100 {
         world.pair(0, 1, &format!("/topic_{number}"), qos[0]);
     }
-    // More than are remembered.
+    // There are more of them than are remembered.
     for number in 0..1_100 {
         world.hosts[1].rings.create_publisher(&format!("/denied_{number}"), qos[0]);
     }
@@ -365,7 +366,7 @@ fn a_peer_says_which_of_its_rules_decides_and_answers_each_question_once() {
     assert_eq!(world.hosts[0].decisions.remove(&2), Some(None), "there is no such peer");
     assert!(world.hosts[0].decisions.is_empty());
 
-    // The host without rules says so.
+    // The host without rules reports that.
     let daemon = world.hosts[0].daemon;
     world.hosts[1].check_access(daemon, 7, uses(&[(4, "/scan")]));
     world.run_for(secs(1));

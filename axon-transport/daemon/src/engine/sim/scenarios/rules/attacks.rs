@@ -1,5 +1,5 @@
-//! Peers whose own daemon ignores all rules: calls, what goes on after rules changed, elections, restarts, and several daemons
-//! of one identity.
+//! Tests peers whose daemon ignores all rules: calls, traffic after a change of the rules, elections, restarts, and
+//! several daemons of one identity.
 
 use axon_envelope::Kind;
 use axon_shm::{
@@ -30,7 +30,7 @@ use crate::{
     link::{GraphUpdate, LinkMessage, RouteSubscriber, Subscribe},
 };
 
-/// A host with rules, and a peer without a daemon of ours.
+/// Creates a host with rules, and a raw peer.
 fn world(rules: &str, daemon: DaemonId) -> World {
     let mut world = World::new(37, 1, |_| {
         let mut config = Config::default();
@@ -41,12 +41,12 @@ fn world(rules: &str, daemon: DaemonId) -> World {
     world
 }
 
-/// The peer opens a stream with these bytes.
+/// Makes the peer open a stream with these bytes.
 fn open(world: &mut World, on: usize, bytes: Vec<u8>) -> Option<quinn_proto::StreamId> {
     world.with_raw(0, |raw, _| raw.links[on].open(bytes))
 }
 
-/// Whether the host asks for this topic on a link.
+/// Returns whether the host asked for this topic on a link.
 fn asks(world: &World, on: usize, topic: &str) -> bool {
     let asks = |m: &LinkMessage| matches!(m, LinkMessage::Subscribe(s) if s.topic == topic);
     world.raws[0].links[on].messages.iter().any(asks)
@@ -83,8 +83,8 @@ fn denied_requests_and_responses_of_a_hostile_peer_reach_no_endpoint() {
         on,
         &LinkMessage::Graph(GraphUpdate { version: 1, added, ..GraphUpdate::default() }),
     );
-    // It also asks for what it may not have: requests of the client, and responses of the server. A host takes the
-    // responses of servers that take its requests.
+    // The peer also asks for data that it may not have: requests of the client, and responses of the server. A host
+    // accepts the responses of servers that take its requests.
     let asks_for =
         [("/open", 100, 1, gids[1]), ("/closed", 101, 1, gids[3]), ("/closed", 102, 2, gids[2])];
     for (name, route, kind, reader) in asks_for {
@@ -157,7 +157,7 @@ fn samples_and_subscribes_after_a_denial_are_neither_delivered_nor_served() {
         let before = world.raws[0].links[on].opened.len();
         let came = received(&world, subscription, of_raw(1)).len();
         world.raws[0].links[on].messages.clear();
-        // The same stream, further ones of the same route, and the same request once more.
+        // The peer sends more on the same stream, opens further streams of the same route, and repeats the request.
         for number in 0..20 {
             let next = 10 + 100 * round + number;
             let more = samples(route, "/t", of_raw(1), [next]).split_off(24);
@@ -178,7 +178,7 @@ fn samples_and_subscribes_after_a_denial_are_neither_delivered_nor_served() {
 
         world.hosts[0].set_access(OPEN);
         world.run_for(secs(2));
-        // It is asked anew, and what it sends on that route arrives.
+        // The host asks again, and samples on that route arrive.
         let route = asked(&mut world, on, "/t");
         let number = 60 + 100 * round;
         open(&mut world, on, samples(route, "/t", of_raw(1), [number]));
@@ -248,7 +248,7 @@ fn changed_rules_apply_during_handshake_election_and_succession() {
     open(&mut world, first, samples(route, "/t", of_raw(1), 1..=2));
     world.run_for(secs(1));
     assert_eq!(received(&world, subscription, of_raw(1)), [1, 2]);
-    // A successor that said HELLO while it was open is elected after it was closed.
+    // A successor that sent HELLO while the rules were open is elected after they were closed.
     let second = dial(&mut world, 0);
     greet(&mut world, second, Some([1; 16]));
     world.hosts[0].set_access(CLOSED);

@@ -1,4 +1,5 @@
-//! Limits between hosts: what either side limits does not cross, and all that is dropped is counted.
+//! Tests limits between hosts: samples beyond the limit of either side do not cross, and all dropped samples are
+//! counted.
 
 use axon_shm::qos::Qos;
 use axon_transport::{
@@ -18,7 +19,7 @@ use crate::{
 
 const TEXT: &str = "[[limit]]\npeer = \"*\"\ntopic = \"/limited\"\nrate = 10\n";
 
-/// Two hosts, of which one has these rules.
+/// Creates two hosts, one of which has these rules.
 fn hosts(with_rules: usize, text: &str) -> World {
     World::new(29, 2, |host| {
         let mut config = Config::default();
@@ -29,7 +30,7 @@ fn hosts(with_rules: usize, text: &str) -> World {
     })
 }
 
-/// Publishes a sample each 10 ms for so many seconds.
+/// Publishes a sample every 10 ms for `seconds`.
 fn publish(world: &mut World, pairs: &[Pair], seconds: u64) {
     for _ in 0..seconds * 100 {
         for pair in pairs {
@@ -72,7 +73,7 @@ fn samples_beyond_a_limit_of_either_host_do_not_cross() {
             assert_eq!(limit.passed, came.len() as u64, "{text}");
             assert_eq!(limit.passed + limit.dropped, 1000, "{text}");
             assert!(limits(&world, 1 - with_rules).is_empty());
-            // Nobody is taken for stalled, and the publisher waits for nothing.
+            // No flow counts as stalled, and the publisher does not wait.
             assert!(world.publish(limited, 10), "{text}");
         }
     }
@@ -170,7 +171,7 @@ fn max_hz_that_changes_counts_for_a_topic_that_is_matched() {
     let pair = world.pair(0, 1, "/limited", Qos::sensor_data());
     world.until(secs(20), World::is_whole);
     world.run_for(secs(1));
-    // Five seconds with a hundred samples each, under each of these.
+    // For each of these limits, a hundred samples a second are published for five seconds.
     for (topics, fits) in [
         (vec![], 500..=500),
         (vec![entry(10.0)], 45..=56),

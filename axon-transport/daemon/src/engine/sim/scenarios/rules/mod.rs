@@ -1,4 +1,4 @@
-//! Rules of one host or the other: what they deny and what they limit.
+//! Tests rules of either host: denials and limits.
 
 mod access;
 mod attacks;

@@ -1,4 +1,4 @@
-//! A peer that takes as many links, and asks for as much, as it gets.
+//! Tests peers that take as many links, and ask for as much, as they get.
 
 #![allow(clippy::print_stdout, reason = "a scenario says what it skips")]
 
@@ -17,7 +17,7 @@ use crate::{
     link::{CloseCode, GraphResync, LinkHello, LinkMessage},
 };
 
-/// A host, and so many hand-driven peers.
+/// Creates a host and `raws` raw peers.
 fn world(seed: u64, raws: u8, config: impl Fn() -> Config) -> World {
     let mut world = World::new(seed, 1, |_| config());
     for raw in 0..raws {
@@ -26,7 +26,8 @@ fn world(seed: u64, raws: u8, config: impl Fn() -> Config) -> World {
     world
 }
 
-/// The first peer dials under a daemon id. Returns the connection, which said HELLO and may be refused.
+/// Makes the first peer dial under a daemon id. Returns the connection, on which the peer has sent HELLO and which the
+/// host may refuse.
 fn greets(world: &mut World, id: u8, replaces: Option<[u8; 16]>) -> usize {
     let to = world.hosts[0].address;
     let number = world.with_raw(0, |raw, now| raw.dial(to, now));
@@ -38,7 +39,7 @@ fn greets(world: &mut World, id: u8, replaces: Option<[u8; 16]>) -> usize {
     number
 }
 
-/// The connections of the first peer that stand.
+/// Returns the open connections of the first peer.
 fn open(world: &World) -> Vec<usize> {
     let links = world.raws[0].links.iter().enumerate();
     links.filter(|(_, link)| link.closed.is_none()).map(|(number, _)| number).collect()
@@ -68,7 +69,7 @@ fn of_the_superseded_links_of_an_identity_the_newest_eight_stand() {
     const RENEWED: usize = 12;
     let mut world = world(91, 1, Config::default);
     let mut links = vec![linked_as(&mut world, 0, 0xff)];
-    // It says nothing over the new ones, so that the host waits for what may come over the old ones.
+    // The peer sends nothing over the new links, so the host waits for frames that may come over the old ones.
     for _ in 0..RENEWED {
         let old = &world.raws[0].links[*links.last().unwrap()];
         let elected = old.messages.iter().find_map(|message| match message {
@@ -87,7 +88,7 @@ fn of_the_superseded_links_of_an_identity_the_newest_eight_stand() {
     }
 }
 
-/// A topic whose name does not become much shorter by compression.
+/// Returns a topic whose name does not become much shorter by compression.
 fn long_topic(number: u64) -> String {
     let mut random = number.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
     let name = (0..500).map(|_| {
@@ -99,8 +100,8 @@ fn long_topic(number: u64) -> String {
     std::iter::once('/').chain(name).collect()
 }
 
-/// Has a peer that reads nothing ask for the graph of the host over so many links, which differ in their daemon id,
-/// until one is closed. Returns the most that waited for it, in bytes.
+/// A peer that reads nothing asks for the graph of the host over `links` links with different daemon ids, until one is
+/// closed. Returns the maximum number of bytes that waited for it.
 fn most_unread(seed: u64, links: u8) -> usize {
     let mut world = world(seed, 1, Config::default);
     for number in 0..16_000 {
@@ -150,7 +151,7 @@ fn a_daemon_id_is_served_as_many_routes_as_hello_says_and_no_more() {
     }
     let mut world = world(94, 1, || {
         let mut config = Config::default();
-        // So that the routes are not refused for their bytes.
+        // With this size the routes are not refused for their bytes.
         config.link.graph = 64 << 20;
         config
     });
@@ -197,7 +198,7 @@ fn a_whole_graph_is_sent_once_a_second_however_often_it_is_asked_for() {
         });
         world.run_for(millis(50));
     }
-    // At once, after each of five seconds, and for what was asked last.
+    // The host sends a graph at once, after each of five seconds, and for the last request.
     let sent = whole(&world) - before;
     assert!((5..=6).contains(&sent), "{sent} whole graphs in five seconds");
     world.run_for(secs(5));

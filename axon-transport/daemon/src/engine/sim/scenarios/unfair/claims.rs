@@ -7,7 +7,7 @@ use crate::engine::sim::{
     world::World,
 };
 
-/// Host 2 claims the id of host 1 towards host 0. Nobody has dialled yet.
+/// Creates a world in which host 2 claims the id of host 1 towards host 0. No host has dialled yet.
 fn world(seed: u64, config: &Settings) -> World {
     let mut world = World::apart(seed, 3, config);
     world.kill(2, false);
@@ -21,7 +21,7 @@ fn is_linked(world: &World, host: usize, with: usize) -> bool {
     world.hosts[host].linked().contains(&world.hosts[with].daemon)
 }
 
-/// Samples cross from host 1 to host 0 for half a minute, and host 0 said who claimed the id.
+/// Checks that samples cross from host 1 to host 0 for half a minute, and that host 0 reports the claim.
 fn goes_on(mut world: World, case: &str) {
     let pair = world.pair(1, 0, "/t", Qos::keep_all());
     world.run_for(secs(5));

@@ -24,7 +24,7 @@ use crate::{
 const MANY: u32 = 12_000;
 /// In one message: it is 4 MiB at most before it is compressed.
 const PART: u32 = 1_800;
-/// What one message counts for while it is handled, at most.
+/// Maximum charge of one message while it is handled.
 const ONE: usize = 28 << 20;
 /// Time between two samples of the other host.
 const EVERY: Duration = Duration::from_millis(10);

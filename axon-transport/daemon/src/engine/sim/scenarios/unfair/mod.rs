@@ -1,4 +1,5 @@
-//! Peers that keep the protocol, and take what is not theirs: a publisher's time, the id of another daemon.
+//! Tests peers that keep to the protocol but take more than their share: a publisher's time, or the id of another
+//! daemon.
 
 mod bounds;
 mod claims;

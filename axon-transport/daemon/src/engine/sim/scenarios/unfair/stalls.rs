@@ -55,12 +55,12 @@ impl Held {
         Self { world, pair, published: 0, length: 100 }
     }
 
-    /// The peer dials under a daemon id, and asks for the topic.
+    /// Makes the peer dial under a daemon id, and ask for the topic.
     fn subscribe(&mut self, id: u8) -> usize {
         self.subscribe_over(id, None)
     }
 
-    /// The same over a link that may replace another one.
+    /// Does the same over a link that may replace another one.
     fn subscribe_over(&mut self, id: u8, replaces: Option<[u8; 16]>) -> usize {
         let to = self.world.hosts[0].address;
         let world = &mut self.world;
@@ -97,7 +97,7 @@ impl Held {
         link
     }
 
-    /// What host 0 calls a link of the peer.
+    /// Returns the id that host 0 gave to a link of the peer.
     fn name(&self, link: usize) -> Option<[u8; 16]> {
         self.world.raws[0].links[link].messages.iter().find_map(|message| match message {
             LinkMessage::Elected(elected) => Some(elected.link),
@@ -105,7 +105,7 @@ impl Held {
         })
     }
 
-    /// Publishes for so long, and does something after each step. Whether many samples were published by then.
+    /// Publishes for `time`, and calls `each` after each step. Returns whether all samples were published by then.
     fn publish(&mut self, time: Duration, mut each: impl FnMut(&mut World)) -> bool {
         let end = self.world.now + time;
         while self.world.now < end && self.published < MANY {
@@ -116,7 +116,7 @@ impl Held {
         self.published == MANY
     }
 
-    /// Host 1 has all that was published, and host 0 says what it gave up.
+    /// Checks that host 1 has all published samples, and that host 0 reports what it gave up.
     fn ends_well(mut self, case: &str) {
         self.world.run_for(secs(5));
         let received = self.world.received(self.pair);
@@ -145,7 +145,7 @@ fn a_peer_that_sends_a_ping_now_and_then_holds_no_publisher_up_for_long() {
                 world.with_raw(0, |raw, _| raw.links[link].quic.ping());
             }
         };
-        // What its QUIC sends by itself becomes rare meanwhile.
+        // Meanwhile the frames that the peer's QUIC sends by itself become rare.
         for _ in 0..40 {
             of.world.run_for(secs(1));
             ping(&mut of.world);
@@ -169,12 +169,12 @@ fn a_host_that_is_switched_off_holds_no_publisher_up_for_long() {
 
 #[test]
 fn a_peer_that_has_one_daemon_after_another_holds_no_publisher_up_for_long() {
-    // What is not acknowledged of samples of 2 KiB is more than the bytes that count as progress.
+    // For samples of 2 KiB the unacknowledged samples exceed the bytes that count as progress.
     for (seed, length) in [(125, 100), (127, 2048)] {
         let mut of = Held { length, ..Held::new(seed) };
         let mut next = Duration::ZERO;
         let (begin, mut ids) = (of.world.now, 0..=0xff);
-        // Each daemon takes over what the one before it did not acknowledge.
+        // Each daemon takes over the samples that the one before it did not acknowledge.
         while of.world.now < begin + secs(85) && of.published < MANY {
             if of.world.now >= next {
                 of.subscribe(ids.next().unwrap());
