@@ -33,32 +33,32 @@ use crate::{config::ConfigError, ids::SessionId, wire::session::CodecError};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum RecvError {
-    /// Nothing came within the timeout.
+    /// No message came within the timeout.
     #[error("no message came within the timeout")]
     TimedOut,
     /// The process forked: the endpoint belongs to the parent.
     #[error("used after fork: a child process must open a session of its own")]
     Forked,
-    /// An event loop of the program's listens already (an [`ExternalLeader`](axon_shm::ExternalLeader)), so
-    /// that the session cannot wake tasks. Waiting in a thread works nevertheless.
+    /// An event loop of the program already listens (an [`ExternalLeader`](axon_shm::ExternalLeader)), so that the
+    /// session cannot wake tasks. Waiting in a thread works nevertheless.
     #[error("session {0} already has an external leader of its waits, and cannot wake tasks")]
     AlreadyLed(SessionId),
 }
 
 impl RecvError {
-    /// Why the control thread cannot listen.
+    /// Returns the error for the reason why the control thread cannot listen.
     pub(in crate::session) fn of_listening(error: &ShmError) -> Self {
         match error {
             ShmError::AlreadyLed(session) => Self::AlreadyLed(*session),
-            // The only other reason to refuse an external leader.
+            // This is the only other reason to refuse an external leader.
             _ => Self::Forked,
         }
     }
 }
 
-/// Why a session could not be opened or used.
+/// The reason why a session could not be opened or used.
 ///
-/// `Debug` says the same as `Display`: it is what a `main` prints that returns the error.
+/// `Debug` prints the same text as `Display`, because a `main` that returns the error prints it with `Debug`.
 ///
 /// ```
 /// use axon_transport::SessionError;
@@ -101,10 +101,10 @@ pub enum SessionError {
          `axon daemon` and `axon_daemon` start one by hand"
     )]
     NoDaemon {
-        /// Where it was looked for.
+        /// The address at which the session looked for it.
         address: String,
     },
-    /// A call that needs a daemon under `AXON_DAEMON=off`.
+    /// A call needs a daemon, but `AXON_DAEMON` is `off`.
     #[error("there is no daemon to ask: AXON_DAEMON is off")]
     Off,
     /// The program to start was not found.
@@ -114,11 +114,11 @@ pub enum SessionError {
          daemon's program",
         list(tried),
         PassedOver(untrusted),
-        // Not from crates.io, where another project owns the name.
+        // The crate is not on crates.io, where another project owns the name.
         env!("CARGO_PKG_REPOSITORY")
     )]
     NoProgram {
-        /// The folders in which it was looked for.
+        /// The folders that were searched.
         tried: Vec<PathBuf>,
         /// Programs with the daemon's names that were not started: they belong to another user, or every user may
         /// replace them.
@@ -129,7 +129,7 @@ pub enum SessionError {
     DaemonFailed {
         /// The program.
         program: PathBuf,
-        /// What it said.
+        /// The output of the program.
         text: String,
     },
     /// Memory cannot be shared, so that the session has to be relayed.
@@ -143,11 +143,11 @@ pub enum SessionError {
     Mismatch {
         /// The variable that differs.
         variable: String,
-        /// Its value or digest here.
+        /// The value or digest of the session.
         ours: String,
-        /// Its value or digest in the daemon.
+        /// The value or digest of the daemon.
         theirs: String,
-        /// Where the daemon listens.
+        /// The address of the daemon.
         address: String,
         /// The daemon's process.
         pid: u32,
@@ -155,9 +155,9 @@ pub enum SessionError {
     /// The daemon refuses the session for another reason.
     #[error("the daemon at {address} refuses the session: {text}")]
     Refused {
-        /// Where the daemon listens.
+        /// The address of the daemon.
         address: String,
-        /// Why.
+        /// The reason.
         text: String,
     },
     /// The process that listens at the daemon's address belongs to another user.
@@ -183,13 +183,13 @@ pub enum SessionError {
     /// The daemon does not answer.
     #[error("the daemon at {address} does not answer")]
     Silent {
-        /// Where it listens.
+        /// The address of the daemon.
         address: String,
     },
     /// The connection to the daemon ended, and there is none yet in its place.
     #[error("the connection to the daemon is lost")]
     Disconnected,
-    /// The daemon said something that it should not.
+    /// The daemon sent a message that breaks the protocol.
     #[error("the daemon broke the session protocol: {0}")]
     Protocol(String),
     /// A name, type hash or depth that no endpoint may have.
@@ -204,7 +204,7 @@ pub enum SessionError {
     Permission {
         /// The topic or service.
         topic: String,
-        /// What denies it, where, and what to DDS it is called.
+        /// The rule that denies the endpoint, its place, and the DDS name of the topic.
         denial: Denial,
     },
     /// The permissions of the session's enclave do not count now, or not in its domain.
@@ -214,18 +214,18 @@ pub enum SessionError {
     /// A setting or a file that it names.
     #[error(transparent)]
     Config(#[from] ConfigError),
-    /// The address of the daemon cannot be used: what is wrong with it, and where.
+    /// The address of the daemon cannot be used. The text says what is wrong with it, and where.
     #[error("{0}")]
     Address(String),
-    /// Shared memory.
+    /// Shared memory failed.
     #[error(transparent)]
     Memory(#[from] ShmError),
-    /// The system refused.
+    /// A system call failed.
     #[error("{what}: {source}{}", OwnLimit(source))]
     System {
-        /// What was tried.
+        /// The attempted operation.
         what: &'static str,
-        /// What the system said.
+        /// The error of the system.
         source: std::io::Error,
     },
 }

@@ -37,11 +37,11 @@ pub struct Session {
 
 #[derive(Debug)]
 pub(super) struct Handle {
-    /// That of `shared`: a take and a publish need nothing else.
+    /// The core of `shared`: a take and a publish need nothing else.
     pub(super) core: Arc<SessionCore>,
     pub(super) shared: Arc<SessionShared>,
     pub(super) thread: Option<JoinHandle<()>>,
-    /// What carries its samples, where it shares no memory.
+    /// The thread that carries the session's samples, if the session shares no memory.
     pub(super) relay: Option<RelayThread>,
 }
 
@@ -50,27 +50,27 @@ impl Session {
         Self { handle: Arc::new(handle) }
     }
 
-    /// Its id.
+    /// Returns the session's id.
     pub fn id(&self) -> SessionId {
         self.core().id
     }
 
-    /// The domain that it is in.
+    /// Returns the session's domain.
     pub fn domain(&self) -> u32 {
         self.core().config.domain
     }
 
-    /// What it does about its daemon.
+    /// Returns the session's policy for its daemon.
     pub fn daemon_policy(&self) -> DaemonPolicy {
         self.core().config.daemon
     }
 
-    /// The daemon it is connected to; `None` while there is none, and in a forked child.
+    /// Returns the connected daemon; `None` while there is none, and in a forked child.
     pub fn daemon(&self) -> Option<DaemonId> {
         if self.is_forked() { None } else { self.core().link.daemon() }
     }
 
-    /// The graph as the daemon last described it; empty in a forked child.
+    /// Returns the graph as the daemon last described it; empty in a forked child.
     pub fn graph(&self) -> Arc<GraphView> {
         if self.is_forked() { Arc::default() } else { self.shared().state().graph.indexed.view() }
     }
@@ -90,8 +90,8 @@ impl Session {
         self.core().segment.wait(ready, timeout)
     }
 
-    /// Has `listener` called on the control thread for every event. It must not block, and must
-    /// not hold the session, which would otherwise never end.
+    /// Sets `listener`, which the control thread calls for every event. The listener must not block. It must not hold
+    /// the session, which would otherwise never end.
     pub fn set_listener(&self, listener: impl Fn(&SessionEvent) + Send + Sync + 'static) {
         if self.is_forked() {
             return;
@@ -107,13 +107,13 @@ impl Session {
         &self.handle.core
     }
 
-    /// Whether its samples pass through the daemon.
+    /// Returns whether the session's samples pass through the daemon.
     pub(in crate::session) fn is_relayed(&self) -> bool {
         self.handle.relay.is_some()
     }
 
-    /// Whether this is a forked child of the session's process. Of its locks some may be held for
-    /// ever then, by threads that were not forked with it.
+    /// Returns whether this is a forked child of the session's process. Threads that were not forked with it may then
+    /// hold some of the session's locks for ever.
     pub(in crate::session) fn is_forked(&self) -> bool {
         self.core().is_forked()
     }
@@ -129,9 +129,9 @@ impl Session {
         self.shared().wait_changed(timeout, reached)
     }
 
-    /// An endpoint's or a node's handle is dropped.
+    /// Handles the end of an endpoint's or a node's handle.
     pub(in crate::session) fn forget_endpoint(&self, gid: &Gid) {
-        // In a forked child it is the parent's still, and its locks may be held.
+        // In a forked child the endpoint still belongs to the parent, and its locks may be held.
         if self.is_forked() {
             return;
         }
@@ -139,7 +139,7 @@ impl Session {
         self.core().wake();
     }
 
-    /// A relay stands for others than before: its writers and the daemon hear of it.
+    /// Announces that a relay stands for other subscriptions than before, to its writers and the daemon.
     pub(in crate::session) fn renew(&self, gid: Gid) {
         if self.is_forked() {
             return;
@@ -151,13 +151,13 @@ impl Session {
 /// Ends the session's threads.
 impl Drop for Handle {
     fn drop(&mut self) {
-        // The thread, and what it has to say, stay with the parent of a forked child.
+        // The threads and their last messages stay with the parent of a forked child.
         if self.core.is_forked() {
             std::mem::forget(self.thread.take());
             std::mem::forget(self.relay.take());
             return;
         }
-        // First: it carries on what the session's publishers left.
+        // The relay thread ends first: it carries the remaining samples of the session's publishers.
         drop(self.relay.take());
         self.core.stop();
         if let Some(thread) = self.thread.take() {

@@ -8,41 +8,41 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crate::ids::Gid;
 
-/// Messages of one reader that are passed over before others have their turn.
+/// Maximum number of messages of one reader that are passed over in one go.
 const BATCH: usize = 64;
 
 /// A message that was taken.
 #[derive(Debug)]
 pub struct MergedSample<T> {
-    /// Its number.
+    /// The number of the message.
     pub number: u64,
-    /// Of the writer's messages, those that the reader has lost by then. Of what is given on, those that
-    /// all have lost since the one before.
+    /// The number of the writer's messages that the reader has lost by then. For a merged message: the number of
+    /// messages that all readers have lost since the merged message before.
     pub lost: u64,
-    /// What was taken.
+    /// The content of the message.
     pub content: T,
 }
 
-/// A writer's messages, by way of all readers of it that there are. What one of them has, and has not
-/// been given on, is not lost when another has gone further or comes to an end.
+/// The messages of one writer, taken through all of its readers. A message that one reader has is not lost while it is
+/// not merged yet, even if another reader is ahead or ends.
 #[derive(Debug)]
 pub struct Merge<T> {
-    /// The number of the newest one that was given on.
+    /// The number of the newest merged message.
     given: Option<u64>,
     ways: BTreeMap<Gid, MergeSource<T>>,
-    /// Whether a reader had more to be dropped than was looked at.
+    /// Whether a reader had more messages to be dropped than one pass examines.
     behind: bool,
-    /// Whether a reader that may lose nothing had messages that it could not give.
+    /// Whether a reader that may lose no message has messages that it cannot give yet.
     held_up: bool,
 }
 
 #[derive(Debug)]
 struct MergeSource<T> {
-    /// Taken, and newer than what was given on.
+    /// The next message of the reader: taken, and newer than the last merged one.
     next: Option<MergedSample<T>>,
-    /// Messages that its reader has lost, as far as is known.
+    /// The number of messages that the reader has lost, as far as is known.
     lost: u64,
-    /// Those among them that come after what was given on.
+    /// The number of lost messages that come after the last merged one.
     missed: u64,
 }
 
@@ -59,70 +59,72 @@ impl<T> Default for MergeSource<T> {
 }
 
 impl<T> Merge<T> {
-    /// These are the readers from now on.
+    /// Replaces the readers.
     pub fn set(&mut self, readers: impl IntoIterator<Item = Gid>) {
         let mut before = std::mem::take(&mut self.ways);
         let ways = readers.into_iter().map(|gid| (gid, before.remove(&gid).unwrap_or_default()));
         self.ways = ways.collect();
     }
 
-    /// The readers.
+    /// Returns the readers.
     pub fn readers(&self) -> impl Iterator<Item = &Gid> {
         self.ways.keys()
     }
 
-    /// Whatever the readers have is given on once more: one of them has what came before.
+    /// Starts again: all messages of the readers are merged once more, because one reader has earlier messages again.
     pub fn rewind(&mut self) {
         self.given = None;
     }
 
-    /// Those up to this number need not be given on.
+    /// Marks the messages up to this number as merged.
     pub fn pass(&mut self, number: u64) {
         self.given = self.given.max(Some(number));
     }
 
-    /// Whether there is one reader, whose messages may go [past it](Self::give).
+    /// Returns whether there is only one reader, whose messages may bypass the merge ([`give`](Self::give)).
     pub fn is_of_one(&self) -> bool {
         self.ways.len() == 1 && !self.behind && !self.holds_any()
     }
 
-    /// Gives on the message of this number, which its caller has taken from the only reader. False: it was given on
-    /// before.
+    /// Merges the message of this number, which the caller has taken from the only reader. Returns false if it was
+    /// merged before.
     pub fn give(&mut self, number: u64) -> bool {
         let is_new = Some(number) > self.given;
         self.given = self.given.max(Some(number));
         is_new
     }
 
-    /// Whether there is a message that a reader has given up to it.
+    /// Returns whether the merge holds a message of this reader.
     pub fn holds(&self, reader: &Gid) -> bool {
         self.ways.get(reader).is_some_and(|way| way.next.is_some())
     }
 
-    /// Whether there is one of any reader.
+    /// Returns whether the merge holds a message of any reader.
     pub fn holds_any(&self) -> bool {
         self.ways.values().any(|way| way.next.is_some())
     }
 
-    /// How many messages there are that readers have given up to it.
+    /// Returns the number of different messages that the merge holds.
     pub fn held(&self) -> usize {
         let numbers = self.ways.values().filter_map(|way| Some(way.next.as_ref()?.number));
         numbers.collect::<BTreeSet<_>>().len()
     }
 
-    /// Whether readers have more that another had than could be dropped in one go: there is no next one
-    /// until that is gone.
+    /// Returns whether a reader has more repeated messages than one pass drops. Until they are dropped there is no next
+    /// message.
     pub fn is_behind(&self) -> bool {
         self.behind
     }
 
-    /// Whether a reader that may lose nothing has messages that it cannot give yet: there is no next one until it can.
+    /// Returns whether a reader that may lose no message has messages that it cannot give yet. Until it can, there is
+    /// no next message.
     pub fn is_held_up(&self) -> bool {
         self.held_up
     }
 
-    /// The next message. `take` has that of one reader. `waits` says of a reader that has none whether there are some that
-    /// it cannot give yet, for want of memory, and may not lose: what others have meanwhile may be newer.
+    /// Returns the next message. `take` takes a message of one reader. For a reader without a message, `waits` returns
+    /// whether it has messages that it may not lose and cannot give yet, for lack of memory. The messages of other
+    /// readers may be newer than those.
     pub fn next(
         &mut self,
         take: impl Fn(&Gid) -> Option<MergedSample<T>>,
@@ -130,7 +132,7 @@ impl<T> Merge<T> {
     ) -> Option<MergedSample<T>> {
         self.look(&take);
         if self.ways.len() > 1 && self.holds_any() {
-            // Where there was nothing there may be by now what was written before that one.
+            // A reader that had no message may by now have one that was written before the others' messages.
             self.look(&take);
         }
         let without = |(reader, way): (&Gid, &MergeSource<T>)| way.next.is_none() && waits(reader);
@@ -141,14 +143,14 @@ impl<T> Merge<T> {
         let there = self.ways.values_mut().filter(|way| way.next.is_some());
         let way = there.min_by_key(|way| way.next.as_ref().map(|next| next.number))?;
         let mut next = way.next.take()?;
-        // What one has lost another may have had.
+        // Another reader may have had the messages that this reader has lost.
         let missing = self.given.map_or(u64::MAX, |given| next.number.saturating_sub(given + 1));
         next.lost = std::mem::take(&mut way.missed).min(missing);
         self.given = Some(next.number);
         Some(next)
     }
 
-    /// Drops what one reader has and another had; whether it [is behind](Self::is_behind).
+    /// Drops messages of readers that are merged already. Returns whether the merge [is behind](Self::is_behind).
     pub fn pass_over(&mut self, take: impl Fn(&Gid) -> Option<MergedSample<T>>) -> bool {
         if self.ways.len() > 1 || self.behind {
             self.look(&take);
@@ -156,7 +158,7 @@ impl<T> Merge<T> {
         self.behind
     }
 
-    /// Has the next message of each reader at hand, if it has one that was not given on.
+    /// Takes the next message of each reader, if the reader has one that is not merged yet.
     fn look(&mut self, take: &impl Fn(&Gid) -> Option<MergedSample<T>>) {
         let given = self.given;
         let is_new = |next: &MergedSample<T>| Some(next.number) > given;
@@ -173,7 +175,7 @@ impl<T> Merge<T> {
                 }
                 left -= 1;
                 let Some(next) = take(reader) else { break };
-                // A writer that was attached anew counts from 0.
+                // The count of a writer that was attached again starts from 0.
                 let lost = next.lost.checked_sub(way.lost).unwrap_or(next.lost);
                 way.lost = next.lost;
                 if is_new(&next) {
@@ -197,11 +199,11 @@ mod tests {
     const ONE: Gid = Gid([1; 16]);
     const OTHER: Gid = Gid([2; 16]);
 
-    /// What readers have: numbers, each with that of the samples lost by then.
+    /// The messages of the readers: numbers, each with the number of samples lost by then.
     #[derive(Default)]
     struct Readers(RefCell<HashMap<Gid, VecDeque<(u64, u64)>>>);
 
-    /// No reader waits for memory.
+    /// Returns false: no reader waits for memory.
     fn never(_: &Gid) -> bool {
         false
     }
@@ -223,7 +225,7 @@ mod tests {
         merge
     }
 
-    /// Whatever there is: the number of each, and that of those lost before it.
+    /// Merges all messages. Returns the number of each, and how many were lost before it.
     fn all(merge: &mut Merge<()>, readers: &Readers) -> Vec<(u64, u64)> {
         let mut all = Vec::new();
         loop {
@@ -268,7 +270,7 @@ mod tests {
     fn merge_keeps_the_order_of_concurrent_samples() {
         let (mut merge, readers) = (merge(), Readers::default());
         let asked = RefCell::new(0);
-        // It is written after the first reader was asked, which has all of it.
+        // The message is written after the first reader was asked; that reader has all messages.
         let take = |reader: &Gid| {
             if asked.replace_with(|asked| *asked + 1) == 1 {
                 readers.have(ONE, whole(1..=5));
@@ -287,7 +289,7 @@ mod tests {
         assert_eq!(all(&mut merge, &readers), [(3, 2)], "before the first");
         readers.have(ONE, [(4, 2), (5, 2), (9, 5)]);
         readers.have(OTHER, [(5, 4), (6, 4), (9, 6), (10, 6), (20, 11)]);
-        // 7 and 8 are of the one's three and the other's two.
+        // 7 and 8 are among the three losses of the one reader and the two of the other.
         let found = all(&mut merge, &readers);
         assert_eq!(found, [(4, 0), (5, 0), (6, 0), (9, 2), (10, 0), (20, 5)]);
         // A gap that no reader reports as lost was never a sample. A reader that attaches again counts from 0.
@@ -350,7 +352,7 @@ mod tests {
         readers.have(OTHER, [(1, 0)]);
         let take = |reader: &Gid| readers.take(reader);
         assert_eq!(merge.next(take, never).unwrap().number, 1);
-        // The memory of 2 to 8 has not come; the other one keeps the newest alone.
+        // The memory of 2 to 8 has not come; the other reader keeps only the newest messages.
         readers.have(OTHER, [(9, 7), (10, 7)]);
         let waits = |reader: &Gid| *reader == ONE;
         assert!(merge.next(take, waits).is_none() && merge.is_held_up());

@@ -46,19 +46,19 @@ use crate::{
     },
 };
 
-/// Only what was lost takes this long.
+/// Timeout of a wait; only a lost message takes this long.
 const EVER: Duration = Duration::from_secs(60);
 const LARGE: usize = 100_000;
 
 /// The daemon's end of a session's socket.
 struct Daemon {
     socket: OwnedFd,
-    /// The session, and what it handed over.
+    /// The id of the session, and the descriptors that it passed.
     id: SessionId,
     handed: PeerDescriptors,
 }
 
-/// A session that was told that the graph is empty.
+/// Opens a session. Its daemon, which the test simulates, sends it an empty graph.
 fn session() -> (Session, Daemon) {
     let (kind, flags) = (SocketType::SEQPACKET, SocketFlags::CLOEXEC);
     let (socket, theirs) = socketpair(AddressFamily::UNIX, kind, flags, None).unwrap();
@@ -94,7 +94,7 @@ fn hear(socket: &OwnedFd) -> ReceivedMessage {
 }
 
 impl Daemon {
-    /// The next message of those that `pick` wants.
+    /// Waits for the next message that `pick` accepts.
     fn hear<T>(&self, mut pick: impl FnMut(SessionMessage) -> Option<T>) -> T {
         loop {
             if let Some(picked) = pick(hear(&self.socket).message) {
@@ -120,7 +120,7 @@ impl Daemon {
         self.say(SessionMessage::Graph(graph), &[]);
     }
 
-    /// Tells everything from the beginning.
+    /// Sends the whole graph again, with these messages.
     fn tell_all(&self, what: Vec<(SessionMessage, Vec<OwnedFd>)>) {
         self.graph(true, true);
         for (message, descriptors) in what {
@@ -130,7 +130,7 @@ impl Daemon {
     }
 }
 
-/// Another session, with a publisher, and how it sees the one that is tested.
+/// Another session with a publisher, and its view of the session under test.
 struct Far {
     session: Arc<SessionSegment>,
     writer: Writer,
@@ -144,8 +144,7 @@ impl Far {
         Self::with(1, session, RingPeer::Remote(view))
     }
 
-    /// Another publisher of the same session, so that the two sessions have to do with each other
-    /// whatever becomes of this one.
+    /// Creates another publisher of the same session, so that the two sessions stay connected when this publisher ends.
     fn beside(&self) -> Self {
         Self::with(2, self.session.clone(), self.view.clone())
     }
@@ -162,7 +161,7 @@ impl Far {
         self.writer.publish(meta, payload).unwrap();
     }
 
-    /// Its answer to a reader that asked.
+    /// Returns the writer's answer to a reader that asked.
     fn grant(&self, attach: &Attach) -> Granted {
         let Attach { reader, writer, lane, qos, after, .. } = *attach;
         let (peer, stands_for) = (self.view.clone(), None);
@@ -185,14 +184,14 @@ impl Far {
         (info.into(), descriptor)
     }
 
-    /// Tells the session under test of a segment.
+    /// Announces a segment to the session under test.
     fn hand(&self, number: u32, daemon: &Daemon) {
         let (segment, descriptor) = self.segment(number);
         let opened = SegmentOpened { session: self.session.id(), segment };
         daemon.say(SessionMessage::Segment(opened), &[descriptor.as_fd()]);
     }
 
-    /// A subscription to it, and its grant.
+    /// Creates a subscription that is matched with the publisher, and returns it with its grant.
     fn matched(&self, session: &Session, daemon: &Daemon) -> (Subscription, Granted) {
         let subscription = subscription(session);
         daemon.say(SessionMessage::Match(self.pair(&subscription)), &[]);
@@ -208,7 +207,7 @@ impl Far {
         Pair { reader: subscription.gid(), writer: self.writer.gid() }
     }
 
-    /// The inode of the memory of its large samples.
+    /// Returns the inode of the memory of the publisher's large samples.
     fn inode(&self) -> u64 {
         let samples = |info: &SegmentInfo| matches!(info.kind, SegmentKind::Samples(_));
         let info = self.session.segments().into_iter().find(samples).expect("large samples");
@@ -242,7 +241,7 @@ fn until(what: &str, mut reached: impl FnMut() -> bool) {
     }
 }
 
-/// How often this process maps the file.
+/// Returns how often this process maps the file.
 fn maps_of(inode: u64) -> usize {
     let maps = fs::read_to_string("/proc/self/maps").unwrap();
     let is = |line: &&str| line.split_whitespace().nth(4) == Some(&inode.to_string());
@@ -259,7 +258,7 @@ fn memory_in_a_repeated_grant_wakes_the_waiting_reader() {
     let received = thread::scope(|scope| {
         let reader = scope.spawn(|| subscription.recv(&mut Vec::new(), Some(EVER)));
         daemon.hear(|message| matches!(message, SessionMessage::Need(_)).then_some(()));
-        // It has found that its memory is missing, and sleeps.
+        // The session has found that the sample's memory is missing, and sleeps.
         let armed = session.segment().armed_word(Purpose::Samples);
         until("it sleeps", || armed.load(std::sync::atomic::Ordering::Relaxed) != 0);
         thread::sleep(Duration::from_millis(20));
@@ -315,7 +314,7 @@ fn a_writer_that_grants_anew_and_anew_takes_no_more_than_two_lanes() {
     let rounds = 50;
     let mut lanes = Vec::new();
     for round in 0..rounds {
-        // What it leaves unread each time keeps the lane.
+        // The sample that each grant leaves unread keeps its lane.
         far.publish(round + 1, b"x");
         let generation = granted.generation ^ 1 | 2;
         daemon.say(SessionMessage::Grant(Granted { generation, ..granted }), &[]);
@@ -389,7 +388,7 @@ fn samples_in_memory_an_ended_writer_did_not_leave_are_lost() {
     let far = Far::new(&daemon);
     let (subscription, _) = far.matched(&session, &daemon);
     let lane = subscription.inner.lock().lanes()[0].1;
-    // Nobody is told of the memory of those that are large, and the writer ends; its process lives.
+    // The session is not told of the memory of the large samples, and the writer ends; its process lives.
     for sequence in 1..=20 {
         far.publish(sequence, &vec![1; if sequence == 1 { 1 } else { LARGE }]);
     }
@@ -399,7 +398,7 @@ fn samples_in_memory_an_ended_writer_did_not_leave_are_lost() {
     until("it is over", || subscription.matched().is_empty());
     assert_eq!(take(&subscription), Some(1), "what is there");
     until("the others are lost", || take(&subscription).is_none() && subscription.lost() == 19);
-    // All of them at once, not one by one as each is waited for.
+    // All of them are lost at once: the session does not wait for each in turn.
     assert!(!subscription.has_data());
     assert_eq!(session.segment().allocate_lane().unwrap().location(), lane, "nor is it kept");
 }
@@ -410,7 +409,7 @@ fn a_daemon_cannot_have_a_session_read_its_own_samples_as_rings_and_lanes() {
     let latched = Qos::default().with_durability(Durability::TransientLocal);
     let publisher =
         session.create_publisher(EndpointSpec::new("/t", "test/Bytes", latched)).unwrap();
-    // Of those that it makes itself, the daemon has no part in the pair.
+    // The daemon takes no part in pairs that the session attaches itself, so this subscription is added without that.
     let spec = EndpointSpec::new("/t", "test/Bytes", latched);
     let described = EndpointFactory(&session).describe(spec, EndpointKind::Subscription).unwrap();
     let subscription = session.adopt_subscription(described);
@@ -433,7 +432,7 @@ fn a_daemon_cannot_have_a_session_read_its_own_samples_as_rings_and_lanes() {
 
     daemon.say(SessionMessage::Match(Pair { reader, writer }), &[]);
     let asked = daemon.hear_attach();
-    // As a publisher would to the first that asks.
+    // The daemon sends the grant that a publisher would send to its first reader.
     let (generation, segments) = (5 << 24 | 1, Vec::new());
     let (first, session, ring, after) = (0, own, sample, None);
     let relayed = None;
@@ -442,7 +441,7 @@ fn a_daemon_cannot_have_a_session_read_its_own_samples_as_rings_and_lanes() {
     daemon.say(SessionMessage::Grant(granted), &[]);
     daemon.say(SessionMessage::Attach(Attach { lane: sample, ..asked.clone() }), &[]);
     daemon.say(SessionMessage::Attach(asked), &[]);
-    // What was said before is done with when this is answered.
+    // The answer to this message shows that the session has handled the messages before it.
     daemon
         .say(SessionMessage::Match(Pair { reader, writer: Gid::new(SessionId::random(), 1) }), &[]);
     let mut grants = Vec::new();
@@ -455,15 +454,15 @@ fn a_daemon_cannot_have_a_session_read_its_own_samples_as_rings_and_lanes() {
     });
     assert!(subscription.matched().is_empty(), "a sample is no ring");
     assert_eq!(grants.len(), 1, "a sample is no lane");
-    // What is as it must be goes through.
+    // A correct grant is accepted.
     daemon.say(SessionMessage::Grant(grants.remove(0)), &[]);
     assert!(subscription.wait_matched(1, EVER));
     publisher.publish(b"x").unwrap();
     assert!(subscription.take(&mut Vec::new()).is_some());
 }
 
-/// Has a test that changes what the whole process may do run in a process of its own. Whether this
-/// is that process.
+/// Runs a test in a process of its own if it changes a state of the whole process. Returns whether this is that
+/// process.
 fn alone(test: &str) -> bool {
     const ALONE: &str = "AXON_TEST_ALONE";
     if env::var(ALONE).is_ok_and(|name| name == test) {
@@ -491,7 +490,7 @@ fn memory_that_could_not_be_handed_over_for_want_of_descriptors_is_later() {
     setrlimit(Resource::Nofile, Rlimit { current: Some(200), ..limit }).unwrap();
     let open = || fs::File::open("/dev/null").ok();
     let mut all: Vec<_> = std::iter::from_fn(open).collect();
-    // One is left, for the memory itself.
+    // One descriptor is left, for the memory itself.
     all.pop();
     publisher.publish(&[1; LARGE]).unwrap();
     let (reader, writer) = (subscription.gid(), Gid::new(SessionId::random(), 1));

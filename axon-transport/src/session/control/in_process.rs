@@ -36,8 +36,7 @@ pub(in crate::session) struct InProcessDaemon {
 }
 
 impl LocalRegistry {
-    /// Updates the endpoints outside the process: adds new endpoints of `daemon`, and removes those that
-    /// ended.
+    /// Updates the endpoints outside the process: adds new endpoints of `daemon`, and removes endpoints that ended.
     pub(crate) fn outside(&self, daemon: DaemonId, added: Vec<Endpoint>, removed: Vec<Gid>) {
         let mut inside = self.lock();
         inside.registry.remote_graph(daemon, false, added, removed);

@@ -220,10 +220,10 @@ impl ControlThread {
         pair.reader.is_of(&self.shared.core.id) && pair.writer.is_of(&self.shared.core.id)
     }
 
-    /// Releases memory of other sessions that no reader here uses any more, and whose end the daemon did not report.
-    /// The daemon does not know that the session holds it: the memory was given up while there was no daemon, or
-    /// while this session was too slow to be told. If everything was `told` anew, requests the memory that is still
-    /// read, so that the daemon will report its end.
+    /// Releases memory of other sessions that no reader here uses any more, if the daemon did not report the end of
+    /// that memory. The daemon does not know that the session holds it: the memory was given up while there was no
+    /// daemon, or while this session was too slow to be told. If everything was `told` anew, requests the memory that
+    /// is still read, so that the daemon will report its end.
     fn drop_unread(&mut self, told: bool) {
         let shared = self.shared.clone();
         let read = |writer: &Gid| {

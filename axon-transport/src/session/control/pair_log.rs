@@ -6,31 +6,31 @@ use crate::wire::session::Pair;
 /// The target of the log lines.
 const TARGET: &str = "axon_transport::pairs";
 
-/// Writer: a reader is served from position `first` on.
+/// Logs for a writer that it serves a reader from position `first` on.
 pub(super) fn granted(pair: &Pair, generation: u64, first: u64) {
     let Pair { reader, writer } = pair;
     tracing::debug!(target: TARGET, %reader, %writer, generation, first, "granted");
 }
 
-/// Reader: the writer's ring is mapped and read from position `first` on.
+/// Logs for a reader that it mapped the writer's ring and reads from position `first` on.
 pub(super) fn accepted(pair: &Pair, generation: u64, first: u64) {
     let Pair { reader, writer } = pair;
     tracing::debug!(target: TARGET, %reader, %writer, generation, first, "accepted");
 }
 
-/// Reader: the writer granted again, because it had forgotten the reader.
+/// Logs for a reader that the writer granted again, because the writer had forgotten it.
 pub(super) fn forgotten(pair: &Pair) {
     let Pair { reader, writer } = pair;
     tracing::debug!(target: TARGET, %reader, %writer, "the writer had forgotten the reader");
 }
 
-/// Reader: the writer ended, and its grant never arrived.
+/// Logs for a reader that the writer ended, and that its grant never arrived.
 pub(super) fn unmet(pair: &Pair, samples: u64) {
     let Pair { reader, writer } = pair;
     tracing::debug!(target: TARGET, %reader, %writer, samples, "unmet");
 }
 
-/// Reader or writer: the pair was removed.
+/// Logs for a reader or writer that the pair was removed.
 pub(super) fn over(pair: &Pair, why: &str) {
     let Pair { reader, writer } = pair;
     tracing::debug!(target: TARGET, %reader, %writer, why, "over");

@@ -97,7 +97,8 @@ impl Drop for Entry {
     }
 }
 
-/// The pairs that hold each session. Of thousands of pairs with hundreds of sessions, one ends at a time.
+/// The pairs that hold each session. There may be thousands of pairs with hundreds of sessions, and one pair ends at a
+/// time.
 #[derive(Default)]
 struct PairRefs {
     pairs: BTreeSet<(Pair, SessionId)>,

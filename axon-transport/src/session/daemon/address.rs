@@ -121,7 +121,7 @@ impl Address {
                 Self { place: Some(place(dir, format!("axon-{domain}"))), name: None }
             }
             Some(dir) => {
-                // As for the name: a daemon serves one network namespace.
+                // The path contains the network namespace like the name: a daemon serves one network namespace.
                 let namespace =
                     std::fs::metadata("/proc/thread-self/ns/net").map_or(0, |m| m.ino());
                 let stem = format!("axon-{domain}-{namespace}");

@@ -81,7 +81,7 @@ impl<'a> Caller<'a> {
                     return Err(SessionError::NoDaemon { address: address.to_string() });
                 }
                 Err(Attempt::Absent) if Instant::now() >= spawn_after => {
-                    // All that a daemon leaves behind look for the next at the same moment.
+                    // After the end of a daemon all its sessions look for the next one at the same time.
                     if turn.is_none() {
                         turn = address.turn();
                         if turn.is_some() {

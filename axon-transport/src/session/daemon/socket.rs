@@ -21,7 +21,7 @@ use crate::wire::session::{CodecError, MAX_DESCRIPTORS, MAX_PACKET, SessionMessa
 pub struct ReceivedMessage {
     /// The message.
     pub message: SessionMessage,
-    /// Its descriptors, close-on-exec.
+    /// The descriptors of the message, close-on-exec.
     pub descriptors: Vec<PassedFd>,
 }
 
@@ -41,7 +41,7 @@ pub enum SocketError {
     /// More descriptors, or a longer packet, than the protocol allows.
     #[error("a packet with more bytes or descriptors than the protocol allows")]
     Truncated,
-    /// This process can hold no more descriptors, so that a packet lost some.
+    /// A packet lost descriptors, because this process can hold no more.
     #[error(
         "this process has no descriptors left for those that came with a packet: raise its \
          RLIMIT_NOFILE (ulimit -n)"

@@ -230,7 +230,7 @@ mod tests {
         assert_eq!(told.load(Ordering::SeqCst), 2);
     }
 
-    /// A function that reports that it was entered, and returns when the test says so.
+    /// Returns a function that reports its entry, and that returns when the test permits.
     fn gate() -> (NewDataCallback, mpsc::Receiver<u64>, mpsc::Sender<()>, Arc<AtomicBool>) {
         let (entered, entries) = mpsc::channel();
         let (go, goes) = mpsc::channel();

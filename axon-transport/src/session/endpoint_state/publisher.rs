@@ -151,10 +151,9 @@ impl PublisherInner {
         !dead.is_empty()
     }
 
-    /// Returns the number up to which the samples are safe whatever becomes of this process: the carriers to other
-    /// processes and hosts have them, and all other readers can read them, since they were sent the memory that the
-    /// samples are in. A thread that waits for this sleeps on the
-    /// session's segment, which wakes it.
+    /// Returns the number up to which the samples survive the end of this process. The carriers to other processes and
+    /// hosts have these samples. All other readers can read them, since they have received the samples' memory. A
+    /// thread that waits for this sleeps on the session's segment, which wakes it.
     pub(in crate::session) fn delivered_up_to(&self, core: &SessionCore) -> u64 {
         let WriterRings::Shared(writer) = &self.rings else { return 0 };
         let (began, number) = (core.memory.connections(), writer.delivered_up_to());

@@ -52,7 +52,7 @@ impl<'a> Receiver<'a> {
         Self { inner, core, listener: None, id: None }
     }
 
-    /// Returns what `take` finds, once it finds a message.
+    /// Returns the message that `take` finds, once it finds one.
     fn poll<T>(
         &mut self,
         context: &Context<'_>,

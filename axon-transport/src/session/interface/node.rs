@@ -76,7 +76,7 @@ impl Node {
         &self.session
     }
 
-    /// Like [`Session::create_publisher`], for this node, whatever node `spec` names.
+    /// Like [`Session::create_publisher`], for this node; the node in `spec` is ignored.
     ///
     /// # Errors
     /// When the specification is out of bounds or there is no memory.
@@ -84,7 +84,7 @@ impl Node {
         self.session.create_publisher(self.own(spec))
     }
 
-    /// Like [`Session::create_subscription`], for this node, whatever node `spec` names.
+    /// Like [`Session::create_subscription`], for this node; the node in `spec` is ignored.
     ///
     /// # Errors
     /// When the specification is out of bounds.
@@ -92,7 +92,7 @@ impl Node {
         self.session.create_subscription(self.own(spec))
     }
 
-    /// Like [`Session::create_server`], for this node, whatever node `spec` names.
+    /// Like [`Session::create_server`], for this node; the node in `spec` is ignored.
     ///
     /// # Errors
     /// When the specification is out of bounds.
@@ -100,7 +100,7 @@ impl Node {
         self.session.create_server(self.own(spec))
     }
 
-    /// Like [`Session::create_client`], for this node, whatever node `spec` names.
+    /// Like [`Session::create_client`], for this node; the node in `spec` is ignored.
     ///
     /// # Errors
     /// When the specification is out of bounds or there is no memory.

@@ -115,11 +115,11 @@ fn read_at(bytes: &[u8], at: usize, out: &mut [u8]) -> usize {
 /// A sample to be sent.
 #[derive(Debug)]
 pub struct OutboundSample<S> {
-    /// Its number and time.
+    /// The number and time of the sample.
     pub meta: Meta,
     /// Number of its publisher's samples that were lost since the previous one.
     pub lost: u64,
-    /// Its payload, which may stay where it is.
+    /// The payload, which may stay in its memory.
     pub content: S,
 }
 

@@ -51,7 +51,7 @@ impl OwnEndpoints {
             .chain(subscriptions.map(|subscription| &subscription.endpoint))
     }
 
-    /// Returns the publishers and subscriptions, with those that are sides of services.
+    /// Returns the publishers and subscriptions, including the sides of services.
     pub(in crate::session) fn all(
         &self,
     ) -> (Vec<Arc<PublisherInner>>, Vec<Arc<SubscriptionInner>>) {

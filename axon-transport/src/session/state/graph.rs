@@ -92,7 +92,7 @@ impl ShownGraph {
         }
     }
 
-    /// Removes an own endpoint that is gone from the graph, whatever the daemon knows.
+    /// Removes an own endpoint that is gone from the graph, even if the daemon still announces it.
     pub(in crate::session) fn remove_dead(&mut self, gid: &Gid) {
         self.tombstones.insert(*gid);
         self.refused.remove(gid);

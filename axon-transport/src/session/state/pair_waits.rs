@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 /// Pairs on one host take less than this.
 const LOCAL_PAIR_TIME: Duration = Duration::from_millis(5);
-/// Factor for the pause after waiting: for so many times its duration, other endpoints do not wait.
+/// Factor for the pause after waiting: for this many times its duration, other endpoints do not wait.
 const PAUSE_FACTOR: u32 = 9;
 /// The time that endpoints may wait one after the other before the pause applies to pairs on one host.
 const ALLOWANCE: Duration = Duration::from_millis(100);
@@ -55,8 +55,7 @@ impl PairWaits {
 mod tests {
     use super::*;
 
-    /// Creates endpoints that take `time` if they wait, otherwise a millisecond. Returns the number of those that
-    /// waited.
+    /// Creates endpoints that take `time` if they wait, otherwise a millisecond. Returns how many waited.
     fn waited(endpoints: usize, time: Duration, far: bool) -> usize {
         let (mut waits, mut now) = (PairWaits::default(), Instant::now());
         let mut waited = 0;

@@ -10,7 +10,7 @@ use crate::{
     session_key::OWNER,
 };
 
-/// Where the test plays one daemon after another.
+/// The address at which the test plays one daemon after another.
 pub(super) struct Stage {
     listener: OwnedFd,
     config: Config,
@@ -28,7 +28,7 @@ impl Stage {
         Self { listener, config, _dir: dir }
     }
 
-    /// The next daemon, once a session has come to it.
+    /// Waits until a session has connected to the next daemon.
     pub(super) fn daemon(&self, number: u8) -> Daemon {
         let mut fds = [PollFd::new(&self.listener, PollFlags::IN)];
         assert_eq!(poll(&mut fds, Some(&EVER.try_into().unwrap())), Ok(1), "nobody comes");
@@ -65,7 +65,7 @@ impl Stage {
     }
 }
 
-/// Waits until the session has done what it was told: it asks for a pair that it is told of last.
+/// Waits until the session has handled all earlier messages: it then asks for the pair that the last message announces.
 pub(super) fn done(daemon: &Daemon, asking: &Subscription) {
     let writer = Gid::new(SessionId::random(), 1);
     daemon.say(SessionMessage::Match(Pair { reader: asking.gid(), writer }), &[]);
@@ -86,14 +86,15 @@ fn pair_survives_a_resync_from_a_new_daemon() {
     let taking = taker.attach(&publisher, None, &daemon);
     drop(daemon);
     let daemon = stage.daemon(2);
-    // It has no more to say of the others than before: they are stopped, and have not come to it.
+    // The new daemon has nothing more to report about the other sessions: they are stopped, and have not connected to
+    // it.
     daemon.tell_all(Vec::new());
     done(&daemon, &subscription);
     assert_eq!(subscription.matched(), [far.writer.gid()]);
     assert_eq!(publisher.matched(), [taker.gid]);
     far.publish(1, b"x");
     assert_eq!(take(&subscription), Some(1));
-    // The publisher waits for its reader still.
+    // The publisher still waits for its reader.
     let held_back = (0..1 << 14).any(|_| match publisher.publish(&[0; 4096]) {
         Ok(_) => false,
         Err(PublishError::Blocked { .. }) => true,
@@ -102,7 +103,7 @@ fn pair_survives_a_resync_from_a_new_daemon() {
     assert!(held_back, "nobody is waited for");
     drop(taking);
 
-    // What it told of itself, and does not repeat, is over.
+    // A pair that this daemon announced, and does not repeat, is over.
     let Pair { reader, writer } = far.pair(&subscription);
     daemon.say(SessionMessage::Match(Pair { reader, writer }), &[]);
     daemon.hear_attach();
@@ -141,7 +142,7 @@ fn a_reattached_reader_resumes_its_position_and_counts_missing_samples() {
     assert_eq!((take(&subscription), take(&subscription)), (Some(2), Some(3)));
     assert_eq!(subscription.lost(), 0, "all of it stood");
 
-    // Where nobody reads, nothing stands.
+    // If no reader is attached, no sample stays in the ring.
     lose();
     assert!(far.writer.detach(pair.reader));
     far.publish(4, b"x");
@@ -152,8 +153,8 @@ fn a_reattached_reader_resumes_its_position_and_counts_missing_samples() {
     assert_eq!(subscription.lost(), 2);
 }
 
-/// A publisher whose reader an earlier daemon did not tell of its grant, and what becomes of it when the application has
-/// dropped it, or the whole session.
+/// An earlier daemon did not pass on a publisher's grant. The test checks the result after the application has dropped
+/// the publisher, or the whole session.
 fn a_grant_is_lost(session_ends: bool) {
     let stage = Stage::new();
     let (session, daemon) = stage.session();

@@ -5,7 +5,7 @@ use rustix::process::{Pid, PidfdFlags, pidfd_open};
 use super::{simulated_daemon::Taker, *};
 use crate::wire::session::Fence;
 
-/// What the session asks the daemon next, and whether it told of memory before that.
+/// Waits for the session's next fence. Also returns whether the session announced memory before it.
 fn hear_fence(daemon: &Daemon) -> (Fence, bool) {
     let mut told = false;
     let fence = daemon.hear(|message| match message {
@@ -38,13 +38,13 @@ fn sample_is_delivered_after_its_segment() {
     let (opened, told) = hear_fence(&daemon);
     assert!(told && opened.number > granted.number);
     daemon.say(SessionMessage::Fence(granted), &[]);
-    // An answer wakes those who wait for room, and they ask once more.
+    // An answer wakes the threads that wait for room, and they ask once more.
     publisher.publish(b"small").unwrap();
     thread::sleep(Duration::from_millis(20));
     assert_eq!(publisher.delivered_up_to(), 1, "that was an answer to something else");
     daemon.say(SessionMessage::Fence(opened), &[]);
     until("both were", || publisher.delivered_up_to() == 3);
-    // Its memory is known by now.
+    // The daemon knows the memory of this sample by now.
     publisher.publish(&[2; LARGE / 2]).unwrap();
     assert_eq!(publisher.delivered_up_to(), 4);
 }
@@ -67,7 +67,7 @@ fn a_fence_answer_counts_for_samples_before_the_fence_despite_later_samples() {
     assert!(again.number > asked.number);
     daemon.say(SessionMessage::Fence(again), &[]);
     until("the second was", || publisher.delivered_up_to() == 2);
-    // A daemon that tells everything anew may have dropped its answer.
+    // A daemon that sends the whole graph again may have dropped its answer.
     publisher.publish(&[1; LARGE]).unwrap();
     assert_eq!(publisher.delivered_up_to(), 2);
     hear_fence(&daemon);
@@ -79,7 +79,7 @@ fn a_fence_answer_counts_for_samples_before_the_fence_despite_later_samples() {
     });
 }
 
-/// A process that only has to live until it is killed.
+/// A process that only lives until it is killed.
 struct Process(std::process::Child);
 
 impl Process {
@@ -100,8 +100,8 @@ impl Drop for Process {
     }
 }
 
-/// A session's publisher that stands for one in a process without shared memory, as the daemon has it
-/// that is the `process`.
+/// Creates a session's publisher that stands for a publisher of a process without shared memory, as the daemon that is
+/// `process` creates it.
 fn stands_in(id: SessionId, daemon: &Daemon, process: &Process) -> (Far, Vec<OwnedFd>) {
     let session = SessionSegment::create(id).unwrap();
     let view = PeerSession::map(daemon.id, daemon.handed.try_clone().unwrap()).unwrap();
@@ -128,7 +128,7 @@ fn memory_that_came_since_it_was_looked_for_is_read_after_the_daemons_death() {
     a_daemon_is_killed_whose_memory(true);
 }
 
-/// Whether the memory of the last samples `comes` before the daemon is killed. If so, they are confirmed, and
+/// Kills a daemon. `comes` says whether the memory of the last samples arrives before. If so, they are confirmed, and
 /// do not come again.
 fn a_daemon_is_killed_whose_memory(comes: bool) {
     let (session, daemon) = session();
@@ -164,6 +164,6 @@ fn a_daemon_is_killed_whose_memory(comes: bool) {
         taken.last() == Some(&4)
     });
     assert_eq!((taken, subscription.lost()), (vec![2, 3, 4], 0));
-    // Nothing is left that would be given up, and counted, later.
+    // No sample is left that would be given up, and counted, later.
     assert_eq!(subscription.inner.lock().slots().look_again(), None);
 }

@@ -12,14 +12,14 @@ use crate::{
     wire::session::{GraphItem, RelayGivenUp},
 };
 
-/// What is read, and the session that it is of as the reader has it.
+/// A reader, and its view of the publisher's session.
 pub(super) struct Taking {
     reader: Reader,
     view: Arc<PeerSession>,
 }
 
 impl Taking {
-    /// The number of the next sample, whose memory the session may have told of meanwhile.
+    /// Waits for the next sample, and returns its number. The session may have announced the sample's memory meanwhile.
     pub(super) fn take(&mut self, daemon: &Daemon) -> u64 {
         let mut taken = None;
         until("a sample", || {
@@ -38,7 +38,7 @@ impl Taking {
     }
 }
 
-/// A reader of another session, which takes when the test says so.
+/// A reader of another session, which takes when the test permits.
 pub(super) struct Taker {
     pub(super) session: Arc<SessionSegment>,
     pub(super) gid: Gid,
@@ -51,7 +51,7 @@ impl Taker {
         Self { session, gid }
     }
 
-    /// Has it attached to a publisher as one that stands for others, or not.
+    /// Attaches the reader to a publisher, as a relay for others or not.
     pub(super) fn attach(
         &self,
         to: &Publisher,
@@ -63,7 +63,7 @@ impl Taker {
         self.take_up(to.endpoint(), lane, &granted, daemon)
     }
 
-    /// Asks for what a publisher grants.
+    /// Asks for a publisher's grant.
     pub(super) fn ask(
         &self,
         of: &Endpoint,
@@ -91,7 +91,7 @@ impl Taker {
         })
     }
 
-    /// Takes up what it was granted.
+    /// Attaches to the ring that the publisher granted.
     pub(super) fn take_up(
         &self,
         of: &Endpoint,
@@ -116,19 +116,19 @@ impl Taker {
         Taking { reader, view }
     }
 
-    /// Itself as the graph has it.
+    /// Returns the reader as the graph shows it.
     fn endpoint(&self, to: &Publisher) -> Endpoint {
         let kind = EndpointKind::Subscription;
         Endpoint { gid: self.gid, kind, ..to.endpoint().clone() }
     }
 }
 
-/// The reader elsewhere that a relay stands for.
+/// A remote reader, for which a relay stands.
 const ELSEWHERE: Gid = Gid([5; 16]);
 /// A publisher keeps only a few samples of this length.
 const LARGE_SAMPLE: &[u8] = &[7; 1 << 19];
 
-/// A publisher that is matched with [`ELSEWHERE`] alone, through a relay.
+/// A publisher that is matched only with [`ELSEWHERE`], through a relay.
 struct Relayed {
     publisher: Publisher,
     relay: Gid,
@@ -146,7 +146,7 @@ impl Relayed {
         (Self { publisher, relay: taker.gid, daemon, session }, taking)
     }
 
-    /// With [`Qos::keep_all`], and a relay that says later what has arrived.
+    /// Creates a pair with [`Qos::keep_all`], and a relay that confirms its samples later.
     fn with_receipts() -> (Self, Taking) {
         let (relayed, mut taking) = Self::new(Qos::keep_all());
         taking.reader.finish_later();
@@ -171,13 +171,13 @@ impl Relayed {
         published
     }
 
-    /// The daemon says that the relay gave up so many samples.
+    /// The daemon reports that the relay gave up `samples` samples.
     fn gives_up(&self, samples: u64) {
         let given_up = RelayGivenUp { reader: self.relay, writer: self.publisher.gid(), samples };
         self.daemon.say(SessionMessage::GivenUp(given_up), &[]);
     }
 
-    /// The daemon says that the relay ended.
+    /// The daemon reports that the relay ended.
     fn ends(&self) {
         let pair = Pair { reader: self.relay, writer: self.publisher.gid() };
         self.daemon.say(SessionMessage::Detach(pair), &[]);
@@ -197,7 +197,7 @@ fn appears(daemon: &Daemon, endpoint: Endpoint) {
     daemon.say(SessionMessage::Graph(graph), &[]);
 }
 
-/// Waits until the session has heard all that was said so far: it asks about a pair when it has.
+/// Waits until the session has handled all earlier messages: it then asks about a pair.
 fn has_heard(daemon: &Daemon, asking: &Subscription) {
     let writer = Gid::new(SessionId::random(), 1);
     daemon.say(SessionMessage::Match(Pair { reader: asking.gid(), writer }), &[]);
@@ -244,7 +244,7 @@ fn a_subscription_is_counted_once_it_is_reached() {
         assert_eq!(taking.take(&daemon), number);
         held
     });
-    // One that has nothing to do with anybody here need not be waited for.
+    // A reader that no endpoint here matches need not be waited for.
     let other = Taker::new();
     let stranger = Endpoint { topic: "/other".into(), ..other.endpoint(&publisher) };
     appears(&daemon, stranger);
@@ -301,12 +301,12 @@ fn a_sample_is_acknowledged_when_the_relay_has_it() {
             assert!(waiting.join().unwrap(), "nobody told it");
         });
     }
-    // What has left carries nothing.
+    // A relay that has ended carries no samples, so the publisher does not wait for it.
     publisher.publish(b"last").unwrap();
     thread::scope(|scope| {
         let waiting = scope.spawn(|| publisher.wait_acknowledged(EVER));
         until("it sleeps", || room().load(std::sync::atomic::Ordering::Relaxed) != 0);
-        // The daemon says that it ended, and not that it gave anything up.
+        // The daemon reports the end of the relay, and no samples that were given up.
         drop(taking);
         relayed.ends();
         assert!(waiting.join().unwrap(), "nobody told it");
@@ -361,7 +361,7 @@ fn given_up_sample_of_a_relay_is_acknowledged_after_the_report_of_the_daemon() {
     taking.reader.finish(3);
     assert!(!publisher.wait_acknowledged(Duration::ZERO), "two are lost");
     assert_eq!((publisher.unacknowledged(), publisher.given_up()), (0, 2));
-    // The message about them comes later, and makes them no more.
+    // The message about these samples comes later, and does not count them again.
     relayed.gives_up(2);
     relayed.ends();
     until("it ended", || publisher.matched().is_empty());
@@ -390,7 +390,7 @@ fn a_reliable_publisher_blocks_until_a_stalled_reader_takes_again() {
     let Relayed { publisher, daemon, .. } = &relayed;
     let published = relayed.fill();
     assert!(matches!(publisher.publish(LARGE_SAMPLE), Err(PublishError::Blocked { .. })));
-    // Nothing of it is given up, and what is taken makes room.
+    // No sample is given up, and each taken sample makes room.
     for sequence in 1..=published {
         assert_eq!(taking.take(daemon), sequence);
     }
@@ -418,10 +418,10 @@ fn an_endpoint_that_is_refused_is_not_in_the_graph() {
         assert_eq!(session.wait_for(&changed, Some(EVER)).unwrap(), [0], "the change is told");
     }
     assert!(shows(&session, reader.gid()) && shows(&session, asking.gid()));
-    // What it has of its own session it keeps.
+    // A refused endpoint keeps its pairs within its own session.
     refused.publish(b"x").unwrap();
     assert!(reader.has_data());
-    // The whole graph, of which the daemon says nothing of it, and a refusal of one that is gone.
+    // The daemon sends the whole graph, without this endpoint, and a refusal of an endpoint that is gone.
     daemon.tell_all(Vec::new());
     let gone = refused.gid();
     drop(refused);

@@ -1,11 +1,11 @@
-//! A reader that never learns of what a publisher granted it, and counts what it lost.
+//! A reader that never gets a publisher's grant, and counts its lost samples.
 
 use axon_shm::internal::Lane;
 
 use super::{followed::Stage, simulated_daemon::Taker, *};
 use crate::wire::session::Unmet;
 
-/// What the daemon is told next of unmet pairs, or of the end of `writer`.
+/// Waits for the next message to the daemon about unmet pairs, or about the end of `writer`.
 fn told(daemon: &Daemon, writer: Gid) -> SessionMessage {
     daemon.hear(|message| match &message {
         SessionMessage::Unmet(_) => Some(message),
@@ -14,13 +14,13 @@ fn told(daemon: &Daemon, writer: Gid) -> SessionMessage {
     })
 }
 
-/// What a reader asked with, as long as it does.
+/// The objects of a reader that asked. It asks as long as they exist.
 struct Asked {
     _lane: Lane,
     _taker: Taker,
 }
 
-/// A publisher of `qos` that published five samples for a reader that was not told of its grant.
+/// Creates a publisher of `qos` that published five samples for a reader that did not get its grant.
 fn granted_in_vain(session: &Session, daemon: &Daemon, qos: Qos) -> (Publisher, Gid, Asked) {
     let spec = EndpointSpec::new("/p", "test/Bytes", qos);
     let publisher = session.create_publisher(spec).unwrap();
@@ -41,7 +41,7 @@ fn each_daemon_is_told_the_losses_of_a_reader_that_timed_out() {
     let writer = publisher.gid();
     drop(publisher);
     assert!(session.shared().state().endpoints.publishers.contains_key(&writer), "it stays");
-    // Its time is over.
+    // The time limit of the publisher has passed.
     session.shared().part_leaving(true);
     session.core().wake();
     let unmet = SessionMessage::Unmet(Unmet { reader, writer, samples: 5 });
@@ -61,7 +61,7 @@ fn an_ending_session_waits_for_a_daemon_to_report_reader_losses() {
     let writer = publisher.gid();
     drop(daemon);
     until("it is lost", || session.daemon().is_none());
-    // It does not stay for readers that keep the last ones.
+    // The publisher does not stay for readers that keep only the last samples.
     drop(publisher);
     let ending = thread::spawn(move || drop(session));
     let daemon = stage.daemon(2);

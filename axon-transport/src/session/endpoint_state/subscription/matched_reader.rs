@@ -22,7 +22,7 @@ pub(in crate::session) enum NumberKind {
 /// The result of the current take at one reader.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) enum TakeTurn {
-    /// Nothing yet: the reader may have a sample.
+    /// No result yet: the reader may have a sample.
     #[default]
     Open,
     /// No sample, since the writer was faster.

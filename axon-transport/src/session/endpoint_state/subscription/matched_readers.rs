@@ -41,7 +41,7 @@ pub(in crate::session) struct ServeRequest {
 
 /// The reaction to a grant.
 pub(in crate::session) enum Accept {
-    /// Nothing: the grant repeats the current one, or it was not requested.
+    /// No change: the grant repeats the current one, or it was not requested.
     Stands,
     /// Map the ring with this lane.
     Map(Lane),

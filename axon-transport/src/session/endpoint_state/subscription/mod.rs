@@ -65,7 +65,7 @@ pub(in crate::session) struct SubscriptionInner {
     pub(in crate::session) ignores_local: bool,
     /// The only publisher that a relay reads, if it does not read all.
     pub(in crate::session) only: Option<Gid>,
-    /// True if it carries samples to another process, which reports what it has received.
+    /// True if the subscription carries samples to another process, which reports the samples that it has received.
     pub(in crate::session) carries: bool,
     /// True if a writer's numbers rise. The responses of a server come in any order.
     pub(in crate::session) rising: bool,
@@ -93,7 +93,7 @@ impl SubscriptionInner {
         Self { shared_depth, stands_for: stands_for.into(), ..Self::reading(endpoint, role, qos) }
     }
 
-    /// The reading side of a client or server.
+    /// Creates the reading side of a client or server.
     pub(in crate::session) fn of_service(endpoint: Endpoint, role: EndpointRole, qos: Qos) -> Self {
         let rising = endpoint.kind != EndpointKind::Client;
         let matched_readers = MatchedReaders::of_service().into();
@@ -204,7 +204,7 @@ impl SubscriptionInner {
         Take::begin(&mut self.lock(), self.take_rules()).sample_of(writer)
     }
 
-    /// Returns what `take` takes; `None` if there is nothing.
+    /// Returns the result of `take`; `None` if there is no message.
     fn take_with<T>(
         &self,
         core: &SessionCore,

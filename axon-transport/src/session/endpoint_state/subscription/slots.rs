@@ -139,8 +139,8 @@ impl Slots {
     }
 
     /// Returns the reader with the oldest next sample, except readers whose writer is faster than the take. Samples
-    /// that a writer wrote before it granted anew come before its later samples, whatever its clock says: in the other
-    /// order, they would count as repeated.
+    /// that a writer wrote before it granted anew come before its later samples, even if their timestamps are later. In
+    /// the other order, they would count as repeated.
     pub(super) fn oldest(&mut self) -> Option<usize> {
         loop {
             let index = self.oldest_by_time()?;

@@ -17,7 +17,7 @@ use crate::{
     wire::session::EndpointRole,
 };
 
-/// A subscription's reader of a publisher of the same session, which is made for it.
+/// Returns a writer and its reader. The publisher is of the same session, and is made for the subscription.
 pub(super) fn reading(session: &Arc<SessionSegment>, writer: Gid, reader: Gid) -> (Writer, Reader) {
     let (qos, peer) = (Qos::default(), RingPeer::Local(session.clone()));
     let options = RingOptions { gid: writer, qos, budget: 0, max_message: 10, expected: 0 };
@@ -62,7 +62,7 @@ impl Served {
         }
     }
 
-    /// The next daemon brings these requests.
+    /// Delivers these requests as the next daemon does.
     fn daemon(&mut self, numbers: impl IntoIterator<Item = u64>) {
         let (ring, reader) = reading(&self.session, self.client, self.server);
         self.requests.end(&self.client);
@@ -103,7 +103,7 @@ fn a_server_takes_each_request_once_in_order_however_many_daemons_bring_it() {
     assert_eq!(of.take_all(), [2, 3, 4, 5], "what an earlier daemon left is not given up as taken");
     let mut of = Served::new();
     for daemon in 0..20 {
-        // None is answered, so the client sends all again.
+        // No request is answered, so the client sends all again.
         of.daemon(1..=daemon / 2);
     }
     assert_eq!(of.take_all(), (1..10).collect::<Vec<_>>());
@@ -190,7 +190,8 @@ fn unannounced_samples_of_an_ended_writer_are_read() {
         found
     };
     assert_eq!(active().len(), writers.len());
-    // As one that died before it noted the sample: no relay reads here, so none is noted.
+    // The writer behaves like one that died before it marked itself as active: no relay reads here, so it is not
+    // marked.
     publishers[10].publish_next(0, b"sample").unwrap();
     assert!(!active().contains(&(gid, writers[10])));
     assert!(matched_readers.end(&writers[10]));
@@ -212,7 +213,7 @@ fn numbers_from_other_hosts_leave_losses_that_can_be_counted() {
         matched_readers.add(reader, None, NumberKind::All);
         let say = |sequence| publisher.publish(Meta::at_nanos(sequence, 0), b"sample");
         say(1).unwrap();
-        // So many cannot have been lost.
+        // A gap of this size cannot be a loss.
         let refused = PublishError::Sequence { sequence: u64::MAX, last: 1 };
         assert_eq!(say(u64::MAX).unwrap_err(), refused);
         say(FURTHEST).unwrap();

@@ -25,11 +25,11 @@ pub(super) const LONG_SAMPLE_BYTES: u64 = SESSION / 8;
 pub struct InboundSample {
     /// The channel on which it arrived.
     pub channel: FlowChannel,
-    /// Its number and time.
+    /// The number and time of the sample.
     pub meta: Meta,
     /// Number of its publisher's samples that were lost since the previous one.
     pub lost: u64,
-    /// Its bytes.
+    /// The bytes of the sample.
     pub payload: Vec<u8>,
 }
 
@@ -62,7 +62,7 @@ pub struct ArrivalPool {
 }
 
 impl ArrivalPool {
-    /// A pool of `limit` bytes.
+    /// Creates a pool of `limit` bytes.
     pub fn new(limit: u64) -> Arc<Self> {
         Arc::new(Self { held: AtomicU64::new(0), limit })
     }
@@ -192,8 +192,8 @@ impl IncomingFlow {
         Ok(Some(InboundSample { channel: name, meta, lost, payload }))
     }
 
-    /// Grants credit to each waiting channel whose sample fits what the session may buffer. A channel whose
-    /// sample does not fit holds up no other one.
+    /// Grants credit to each waiting channel whose sample fits what the session may buffer. A channel whose sample does
+    /// not fit holds up no other channel.
     pub fn grants(&mut self) -> Vec<Credit> {
         let mut granted = Vec::new();
         self.is_short = false;

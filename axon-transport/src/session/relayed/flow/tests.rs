@@ -12,7 +12,7 @@ use crate::wire::session::{SampleFragment, SampleHeader};
 
 const MAX: u64 = 1 << 20;
 
-/// Those of requests and of responses beside those of publishers.
+/// Returns a channel: of a publisher for even numbers, of requests or responses for odd ones.
 fn channel(number: u8) -> FlowChannel {
     let writer = Gid([number / 2; 16]);
     if number.is_multiple_of(2) {
@@ -135,7 +135,7 @@ fn a_long_sample_that_is_not_read_holds_up_none_but_long_ones() {
     assert_eq!(granted(&mut incoming), [channel(1)], "the next of those that are long");
     incoming.retain(|name| *name != channel(1));
     assert_eq!(granted(&mut incoming), [channel(4)]);
-    // Those that are not long are not without a bound, either.
+    // Samples that are not long are bounded as well.
     for number in 6..20 {
         incoming.open(channel(number), 0);
         assert_eq!(incoming.piece(piece(number, head(LONG_SAMPLE_BYTES as u32), 0)), Ok(None));
@@ -205,8 +205,8 @@ fn credit_for_a_closed_channel_opens_no_later_one() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(48))]
 
-    /// Samples of any sizes on several channels, of which some are not read for a while: all arrive
-    /// whole and in order, and nobody holds more than there is credit for.
+    /// Samples of any sizes on several channels, some of which are not read for a while: all samples arrive whole and
+    /// in order, and neither side holds more than the credit.
     #[test]
     fn all_arrive_whole_in_order_and_within_bounds(
         sizes in prop::collection::vec((0u8..4, 0usize..200_000), 1..40),
@@ -251,7 +251,7 @@ proptest! {
                     break;
                 }
             }
-            // What is stuck goes on only when nothing else does.
+            // The stuck channel goes on only when no other sample moves.
             let keep = held
                 .iter()
                 .any(|sample| sample.channel != channel(stuck)) || sent;

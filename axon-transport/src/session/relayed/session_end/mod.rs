@@ -160,7 +160,7 @@ impl<'a> RelayConnection<'a> {
         // A client may have ended while there was no daemon.
         let graph = common.outside.graph();
         unanswered.keep_clients(|client| graph.endpoints.contains_key(client));
-        // This end trusts its daemon with memory: there is one daemon, and this end takes only as much as it gives
+        // This end needs no bound for its daemon: there is one daemon, and this end takes only as much as it gives
         // credit for.
         let incoming =
             IncomingFlow::new(common.shared.core.config.max_message, ArrivalPool::new(u64::MAX));

@@ -26,7 +26,7 @@ use crate::{
 
 pub(super) struct SessionRelay {
     subscription: Subscription,
-    /// Its publisher, which may have ended.
+    /// The relay's publisher, which may have ended.
     publisher: Arc<Endpoint>,
     stands_for: BTreeSet<Gid>,
     /// Samples that it has lost, as far as the daemon knows.
