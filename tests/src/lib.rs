@@ -1,4 +1,4 @@
-//! What the test processes and the tests that start them have in common.
+//! Code that the test processes and the tests that start them share.
 
 #[cfg(target_os = "linux")]
 pub mod memory;
@@ -20,11 +20,11 @@ use rustix::process::{Signal, getpid, kill_process};
 pub fn end_with_stdin() {
     let mut ignored = [0; 64];
     while std::io::Read::read(&mut std::io::stdin(), &mut ignored).is_ok_and(|count| count > 0) {}
-    // To itself: that cannot fail while there is somebody to see it fail.
+    // The signal goes to this process itself. It cannot fail while the process exists.
     let _ = kill_process(getpid(), Signal::TERM);
 }
 
-// Its own documentation tests are off: most are rustls's, which call the crate `rustls`.
+// Its own documentation tests are off: most of them are rustls's, which call the crate `rustls`.
 #[cfg(doctest)]
 #[doc = include_str!("../../third_party/rustls-axon/README.md")]
 struct RustlsAxonReadme;

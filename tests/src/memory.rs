@@ -13,7 +13,7 @@ use rustix::process::{Pid, Signal, kill_process};
 
 /// Length of a piece: shorter than any part of a secret worth having, too long to occur by chance.
 const PIECE: usize = 8;
-/// Bits by which most bytes are told apart from the start of a piece.
+/// Number of bits of an index into a filter, which rules out most positions as the start of a piece.
 const FILTER: u32 = 20;
 const PAGE: usize = 4096;
 /// Bytes of the stack of a thread that Rust's library or tokio makes. Other memory may follow in the
@@ -26,10 +26,10 @@ pub struct Needles {
     filter: Vec<bool>,
 }
 
-/// What a piece belongs to.
+/// The secret to which a piece belongs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Secret {
-    /// What kind of secret it is.
+    /// The kind of secret.
     pub kind: &'static str,
     /// Which one of that kind.
     pub number: usize,
@@ -38,9 +38,9 @@ pub struct Secret {
 /// Adjacent pieces of one secret.
 #[derive(Clone, Debug)]
 pub struct Find {
-    /// Whose pieces they are.
+    /// The secret of the pieces.
     pub secret: Secret,
-    /// Where they are.
+    /// The address of the pieces.
     pub address: usize,
     /// Bytes from the first to the last.
     pub length: usize,
@@ -48,7 +48,7 @@ pub struct Find {
     pub mapping: String,
     /// Whether the mapping is locked, left out of core files, and wiped in a forked child.
     pub guarded: bool,
-    /// Whether they are on the stack of a thread that lives.
+    /// Whether the pieces are on the stack of a living thread.
     pub on_stack: bool,
 }
 
@@ -100,7 +100,7 @@ struct Mapping {
     end: usize,
     name: String,
     guarded: bool,
-    /// Where the part of it that is a stack ends; its start if no part is.
+    /// The end of the part that is a stack; the start of the mapping if no part is a stack.
     stack_end: usize,
 }
 
@@ -125,8 +125,8 @@ impl Stopped {
         Ok(stopped)
     }
 
-    /// Searches all of its writable memory: stacks, heaps, what was freed, and mappings. Needs the
-    /// right to trace it.
+    /// Searches all of the process's writable memory: stacks, heaps, freed memory, and mappings. Needs the right to
+    /// trace the process.
     ///
     /// # Errors
     /// The process is gone, or its memory may not be read.
@@ -178,7 +178,7 @@ fn search_stopped(pid: u32, needles: &Needles) -> io::Result<Vec<Find>> {
             let mut entry = [0; 8];
             pagemap.read_exact_at(&mut entry, (page / PAGE * 8) as u64)?;
             let mut bytes = [0; PAGE];
-            // Present or swapped; what was never touched holds nothing.
+            // The page is present or swapped. A page that was never touched contains nothing.
             if u64::from_ne_bytes(entry) >> 62 != 0
                 && memory.read_exact_at(&mut bytes, page as u64).is_ok()
             {
@@ -221,7 +221,7 @@ fn search_run(
     found.extend(last);
 }
 
-/// Where the stacks of a stopped process's threads are.
+/// Returns the stack pointers of a stopped process's threads.
 fn stack_pointers(pid: u32) -> io::Result<Vec<usize>> {
     let mut pointers = Vec::new();
     for thread in fs::read_dir(format!("/proc/{pid}/task"))? {

@@ -2,10 +2,10 @@
 
 use std::str::FromStr;
 
-/// How long the samples of a stream are.
+/// The lengths of the samples of a stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Sizes {
-    /// Nothing to 300 KB: inline, in the ring, in one packet, in many.
+    /// Zero bytes to 300 KB: samples inline, in the ring, in one packet, and in many.
     Mixed,
     /// Some hundred bytes.
     Small,
@@ -14,7 +14,7 @@ pub enum Sizes {
 const MIXED: [usize; 12] = [0, 1, 95, 96, 97, 1_100, 1_500, 4_096, 20_000, 65_535, 65_536, 300_000];
 
 impl Sizes {
-    /// As a process is told.
+    /// Returns the name that a test process takes as argument.
     pub fn name(self) -> &'static str {
         match self {
             Self::Mixed => "mixed",

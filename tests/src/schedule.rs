@@ -9,9 +9,9 @@ use sha2::{Digest, Sha256, Sha384};
 /// A secret of a connection.
 #[derive(Clone)]
 pub struct Secret {
-    /// What RFC 8446 and RFC 9001 call it.
+    /// The name in RFC 8446 and RFC 9001.
     pub name: String,
-    /// Its bytes.
+    /// The bytes of the secret.
     pub bytes: Vec<u8>,
 }
 
@@ -22,12 +22,12 @@ impl Secret {
     }
 }
 
-/// How a connection's secrets come about.
+/// The source of a connection's secrets.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Mode {
-    /// From a pre-shared key.
+    /// A pre-shared key.
     Psk(PskKex),
-    /// From a key exchange alone.
+    /// A key exchange alone.
     Hybrid,
 }
 
@@ -40,7 +40,7 @@ impl fmt::Display for Mode {
     }
 }
 
-/// What the two ends of a connection know before it begins.
+/// The data that the two ends of a connection share before it begins.
 #[derive(Clone, Copy)]
 pub struct Terms<'a> {
     /// The cipher suite.
@@ -110,8 +110,8 @@ pub struct Schedule {
 }
 
 impl Schedule {
-    /// Computes the secrets. `transcript` is ClientHello to the client's Finished, and `shared` what the key exchange
-    /// gave. Where there was one and that is not known, the schedule ends where it comes in.
+    /// Computes the secrets. `transcript` is ClientHello to the client's Finished, and `shared` the result of the key
+    /// exchange. If there was a key exchange and `shared` is `None`, the schedule ends where its result is needed.
     ///
     /// # Panics
     /// The transcript is not complete.
@@ -215,12 +215,12 @@ impl Schedule {
         })
     }
 
-    /// What `derive_psk()` makes of a QKD key.
+    /// Returns the PSK that `derive_psk()` derives from a QKD key.
     pub fn psk(terms: Terms<'_>) -> Vec<u8> {
         Self::empty(terms.cipher).pre_shared_key(terms)
     }
 
-    /// The same, by the words of its documentation.
+    /// Computes the PSK as the documentation of `derive_psk()` specifies it.
     fn pre_shared_key(&mut self, terms: Terms<'_>) -> Vec<u8> {
         let (sha256, len) = (Hash(Cipher::ChaCha20Poly1305), self.hash.len());
         let prk = sha256.hmac(b"AXON-QKD-TLS13-EXTERNAL-PSK-v1", terms.key);
@@ -258,7 +258,7 @@ impl Schedule {
         &self.in_use
     }
 
-    /// What the exporter gives for this label without a context, and before it the secret that this is expanded from;
+    /// Returns the exporter's output for this label without a context, after the secret from which it is expanded;
     /// `None` where the schedule ends earlier.
     pub fn export(&self, label: &str) -> Option<[Vec<u8>; 2]> {
         if self.exporter.is_empty() {
@@ -291,7 +291,7 @@ pub fn flights(transcript: &[u8]) -> Option<[&[u8]; 3]> {
     Some([ends[1].1, of_server, of_client].map(|end| &transcript[..end]))
 }
 
-/// RFC 8448, section 3: what makes this key schedule worth anything.
+/// Compares the key schedule with RFC 8448, section 3. Without this test the searches would prove nothing.
 #[test]
 fn the_key_schedule_is_that_of_rfc_8448() {
     let hash = Hash(Cipher::ChaCha20Poly1305);

@@ -1,4 +1,4 @@
-//! What is derived of a KME key, and where it was found.
+//! Secrets that are derived from a KME key, and the places where they were found.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -20,8 +20,8 @@ impl Needles {
         self.add_text(secret, STANDARD.encode(key).as_bytes());
     }
 
-    /// Adds `HKDF-SHA256` of a key: what [`add_extracted`](Self::add_extracted) adds, and as `kind`
-    /// what is expanded, which it returns.
+    /// Adds `HKDF-SHA256` of a key: the secrets of [`add_extracted`](Self::add_extracted), and as `kind` the expanded
+    /// secret, which it returns.
     pub fn add_derived(
         &mut self,
         kind: &'static str,
@@ -55,8 +55,8 @@ impl Needles {
         }
     }
 
-    /// Adds what AES-256-GCM computes of its key once (NIST SP 800-38D, 7.1): the key of GHASH. It opens nothing, but lets
-    /// messages be forged.
+    /// Adds the key of GHASH, which AES-256-GCM computes once from its key (NIST SP 800-38D, 7.1). It decrypts nothing,
+    /// but an attacker can forge messages with it.
     pub fn add_ghash_key(&mut self, kind: &'static str, number: usize, aead_key: &[u8; 32]) {
         let mut block = [0; 16].into();
         Aes256::new(aead_key.into()).encrypt_block(&mut block);
@@ -82,7 +82,7 @@ impl Needles {
         }
     }
 
-    /// Adds what `HKDF-SHA256` extracts from a key, and the two states of HMAC that stand for it.
+    /// Adds the key that `HKDF-SHA256` extracts from a key, and the two states of HMAC that are equivalent to it.
     pub fn add_extracted(&mut self, number: usize, salt: Option<&[u8]>, key: &[u8]) {
         let (prk, _) = Hkdf::<Sha256>::extract(salt, key);
         self.add("PRK", number, &prk);
@@ -112,7 +112,7 @@ pub fn tag_masks(aead_key: &[u8; 32], nonce_prefix: [u8; 8]) -> [[u8; 16]; 10] {
     })
 }
 
-/// What SHA-256 begins with (FIPS 180-4, 5.3.3).
+/// The initial state of SHA-256 (FIPS 180-4, 5.3.3).
 const INITIAL: [u32; 8] = [
     0x6a09_e667,
     0xbb67_ae85,
@@ -124,7 +124,7 @@ const INITIAL: [u32; 8] = [
     0x5be0_cd19,
 ];
 
-/// Prints what was found that is not `allowed`; returns how many pieces that is.
+/// Prints the findings that are not `allowed`; returns their number.
 pub fn unexpected(name: &str, found: &[Find], allowed: impl Fn(&Find) -> bool) -> usize {
     let wrong: Vec<&Find> = found.iter().filter(|find| !allowed(find)).collect();
     let mut kinds: BTreeMap<&str, BTreeSet<usize>> = BTreeMap::new();

@@ -1,4 +1,4 @@
-//! What a test process says: a JSON line each.
+//! The output of a test process: one JSON line for each message.
 
 use std::io::{self, Write};
 
@@ -11,19 +11,19 @@ use crate::{Sizes, payload};
 pub enum Word {
     /// The endpoint is there; a publisher has the readers that it waited for.
     Ready,
-    /// How far a publisher is.
+    /// The progress of a publisher.
     Published(u64),
-    /// A publisher is done: so many samples.
+    /// A publisher has sent all samples; their number.
     Sent(u64),
-    /// How far a subscription is.
+    /// The progress of a subscription.
     Taken(Tally),
 }
 
 impl Word {
-    /// Says it on standard output.
+    /// Prints the message on standard output.
     ///
     /// # Errors
-    /// When nobody listens any more.
+    /// No process reads the output any more.
     pub fn say(&self) -> io::Result<()> {
         let mut line = serde_json::to_vec(self)?;
         line.push(b'\n');
@@ -31,7 +31,7 @@ impl Word {
     }
 }
 
-/// What a subscription took from its one publisher.
+/// The samples that a subscription took from its one publisher.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Tally {
     /// Samples.
@@ -44,7 +44,7 @@ pub struct Tally {
     pub missing: u64,
     /// Samples that came again, or after a later one.
     pub repeated: u64,
-    /// Samples that were not what was published.
+    /// Samples with other content than published.
     pub corrupt: u64,
     /// Samples that the subscription counted as lost.
     pub lost: u64,

@@ -66,14 +66,14 @@ impl Authority {
         Self { issuer: Issuer::new(params, key()), key: key(), pem: pair.cert }
     }
 
-    /// The same certificate as version 1: without its number and its extensions, and signed again.
+    /// Returns the same certificate as version 1: without its number and its extensions, and signed again.
     fn in_version_1(&self, pair: &Pair) -> Pair {
         let cert = version_1(&pair.cert, &self.key);
         Pair { cert, key: pair.key.clone() }
     }
 }
 
-/// What a certificate with this common name, and these DNS names, is to say.
+/// Returns the parameters of a certificate with this common name and these DNS names.
 fn named(name: &str, dns: &[&str]) -> CertificateParams {
     let names: Vec<_> = dns.iter().map(|name| (*name).to_owned()).collect();
     let mut params = CertificateParams::new(names).unwrap();
@@ -173,7 +173,7 @@ fn sae(dir: &Path, ca: &str, pair: &Pair, url: &str) -> ConfigBuilder {
         .sae_key(write(dir, "client.key", &pair.key, 0o600))
 }
 
-/// What the daemon's client of a KME says when it asks for a status.
+/// Returns the result of the daemon's KME client for a status request.
 async fn asked(config: &QkdConfig) -> Result<(), String> {
     let (kme, _events) = Kme::start(config, UsedKeys::in_memory()).unwrap();
     kme.probe("sae-b").await.map(drop).map_err(|failure| failure.to_string())
@@ -212,7 +212,7 @@ async fn a_kme_of_version_1_is_refused_by_that_name() {
     let good = ca.issue("kme-a", &["localhost"]);
     let sent_along =
         |pair: &Pair, pem: &str| Pair { cert: format!("{}{pem}", pair.cert), ..pair.clone() };
-    // A root is a name and a key, whatever its version. A CA below it has to say that it is one, in an extension.
+    // A root is only a name and a key, in any version. A CA below it must state in an extension that it is a CA.
     let old_root = sent_along(&good, &version_1(&ca.pem, &ca.key));
     let below = ca.below_in_version_1();
     let old_issuer = sent_along(&below.issue("kme-a", &["localhost"]), &below.pem);
@@ -241,7 +241,7 @@ fn an_saes_certificate_of_version_1_is_refused_by_setting_and_file() {
     for part in ["AXON_SAE_CERT", "client.pem", VERSION_1, "version 3"] {
         assert!(text.contains(part), "{part}: {text}");
     }
-    // A root is a name and a key, whatever its version.
+    // A root is only a name and a key, in any version.
     let roots = version_1(&ca.pem, &ca.key);
     Kme::check(&qkd(sae(dir.path(), &roots, &client, "https://127.0.0.1:9"))).unwrap();
 }
@@ -337,10 +337,10 @@ async fn a_kme_without_a_name_is_known_by_its_id_where_that_is_said() {
     assert!(text.contains("name"), "{text}");
     let by_id = |id: &str| settings().kme_id(id).kme_quirks([QkdConfig::NO_NAME_CHECK]);
     asked(&qkd(by_id("kme-a"))).await.unwrap();
-    // Another KME of the same CA is still told apart.
+    // The client still distinguishes another KME of the same CA.
     let text = asked(&qkd(by_id("kme-b"))).await.unwrap_err();
     assert!(text.contains("kme-a") && text.contains("kme-b"), "{text}");
-    // Nothing would be left to know it by.
+    // Otherwise the client could not identify the KME at all.
     let error = settings().kme_quirks([QkdConfig::NO_NAME_CHECK]).build().unwrap_err();
     assert_eq!(error.variable(), "AXON_KME_QUIRKS");
     assert!(error.to_string().contains("AXON_KME_ID"), "{error}");

@@ -1,5 +1,4 @@
-//! The daemon for tests: like `axon_daemon`, and it ends with its standard input when it is told
-//! to by `--while-stdin`.
+//! The daemon for tests: like `axon_daemon`. With `--while-stdin` it ends when its standard input ends.
 
 use std::process::ExitCode;
 

@@ -1,13 +1,11 @@
-//! An application for tests, with its settings from the environment. It ends with its standard
-//! input.
+//! An application for tests, with its settings from the environment. It ends when its standard input ends.
 //!
-//! `publish TOPIC SIZES READERS COUNT`: waits for as many readers, then publishes; with a count of
-//! `stream` until the first line on standard input, one a millisecond, and with one of `flood` as fast
-//! as it may. `subscribe TOPIC SIZES`: takes, and compares; `history` the same, with what was published before.
-//! `serve SERVICE COUNT`: answers as many requests with their bytes reversed, and takes one more.
-//! `ask SERVICE COUNT`: sends as many requests, and takes no response. `alive TOPIC`: a publisher that
-//! has a lease of half a second, and publishes nothing. `everything NAME`: a node with one endpoint of
-//! each kind under that name.
+//! `publish TOPIC SIZES READERS COUNT`: waits for READERS readers, then publishes COUNT samples. With `stream` as COUNT
+//! it publishes one sample a millisecond until the first line on standard input. With `flood` it publishes as fast as
+//! it may. `subscribe TOPIC SIZES`: takes and compares samples. `history` does the same, with the samples that were
+//! published before. `serve SERVICE COUNT`: answers COUNT requests with their bytes reversed, and takes one more. `ask
+//! SERVICE COUNT`: sends COUNT requests, and takes no response. `alive TOPIC`: a publisher that has a lease of half a
+//! second, and publishes nothing. `everything NAME`: a node with one endpoint of each kind under that name.
 
 use std::{
     error::Error,
@@ -33,7 +31,7 @@ const PACE: Duration = Duration::from_millis(1);
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
-    // What the daemon refuses is logged, in the log of the test's host.
+    // The log of the test's host contains the daemon's refusals.
     let log =
         tracing_subscriber::fmt().with_max_level(tracing_subscriber::filter::LevelFilter::ERROR);
     log.with_ansi(false).with_writer(std::io::stderr).init();
@@ -109,7 +107,7 @@ fn publish(
             match publisher.publish(&bytes) {
                 Ok(sequence) if sequence == sent + 1 => break,
                 Ok(sequence) => return Err(format!("{sequence} after {sent}").into()),
-                // The reader is slow: this is what KEEP_ALL means.
+                // The reader is slow: KEEP_ALL blocks the publisher.
                 Err(PublishError::Blocked { .. }) => {}
                 Err(error) => return Err(error.into()),
             }
@@ -124,7 +122,7 @@ fn publish(
         }
     }
     Word::Sent(sent).say()?;
-    // It lives until the test has seen what it sent arrive.
+    // The process lives until the test has seen its samples arrive.
     while stdin.recv().is_ok() {}
     Ok(())
 }
@@ -194,7 +192,7 @@ fn ask(
     Ok(())
 }
 
-/// What comes on standard input; disconnected when it ends.
+/// Returns the bytes of standard input. The receiver is disconnected when standard input ends.
 fn bytes_of_stdin() -> Receiver<u8> {
     let (sender, receiver) = mpsc::channel();
     thread::spawn(move || {

@@ -30,7 +30,7 @@ pub(crate) fn key(number: u64) -> [u8; 32] {
     key
 }
 
-/// Its key_ID.
+/// Returns the key_ID of this number.
 pub(crate) fn key_id(number: u64) -> String {
     format!("00000000-0000-4000-8000-{number:012x}")
 }
@@ -64,7 +64,7 @@ fn listen(dir: &Path) -> String {
         for stream in listener.incoming() {
             let connection = ServerConnection::new(Arc::clone(&tls)).unwrap();
             let stream = StreamOwned::new(connection, stream.unwrap());
-            // An error ends the connection, as the client wanted or the script says.
+            // An error ends the connection, as the client or the script intends.
             std::thread::spawn(move || answer(stream));
         }
     });
@@ -73,7 +73,7 @@ fn listen(dir: &Path) -> String {
 
 type Stream = StreamOwned<ServerConnection, TcpStream>;
 
-/// Answers requests. The SAE ID in the path says how.
+/// Answers requests. The SAE ID in the path selects the script.
 fn answer(mut stream: Stream) -> std::io::Result<()> {
     stream.sock.set_nodelay(true)?;
     loop {
@@ -131,8 +131,8 @@ enum Request {
     Keys { script: String, keys: Vec<u64> },
 }
 
-/// The script, and the numbers of the keys to answer with: the same in each call, or where the
-/// script asks for new ones, those that follow.
+/// Reads a request. Returns the script, and the numbers of the keys to answer with. They are the same in each call,
+/// unless the script asks for new ones; then the next numbers follow.
 fn request(stream: &mut Stream) -> std::io::Result<Request> {
     static NEXT: AtomicU64 = AtomicU64::new(0);
     let mut head = Vec::new();

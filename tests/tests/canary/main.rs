@@ -1,12 +1,11 @@
-//! Which memory is given back with a key in it.
+//! Tests which blocks of memory are released with a key in them.
 //!
-//! Every block that is freed, or left behind by growing, between the making of a client and the
-//! end of its runtime is kept as it was and searched for each key of the call, raw and as base64.
-//! So is all that a pool held, and the private key of the SAE.
-//! None that etsi-qkd014 asked for may hold as much as eight bytes of one. Those of the TLS and
-//! HTTP libraries that do are listed by call site: a new one fails.
+//! Between the making of a client and the end of its runtime, every block that is freed, or left behind by growing, is
+//! kept unchanged. It is searched for each key of the call, raw and as base64. The same holds for all keys of a pool,
+//! and for the private key of the SAE. No block that etsi-qkd014 allocated may hold as much as eight bytes of a key.
+//! Blocks of the TLS and HTTP libraries that do are listed by call site: a new site fails the test.
 //!
-//! Here and not with the crate, which forbids unsafe code: an allocator needs it.
+//! The tests are here and not with the crate, which forbids unsafe code: an allocator needs it.
 
 mod kme;
 #[path = "../kmes/mod.rs"]
@@ -33,11 +32,11 @@ const MANY: u64 = 300;
 /// The memory below the last chunk, where the connection's task, on another thread, was late.
 const LATE: &str = "hyper::proto::h1::io::Buffered<T,B>::poll_read_from_io";
 
-/// Where blocks with key bytes may come from, as the documentation of etsi-qkd014 says.
+/// The call sites that may leave key bytes in blocks, as the documentation of etsi-qkd014 says.
 const LIBRARIES: [&str; 2] = [
     // The plaintext of a record, waiting for its reader.
     "rustls::msgs::base::Payload::into_vec",
-    // What came from the socket, deciphered in place.
+    // Bytes from the socket, decrypted in place.
     "rustls::msgs::deframer::buffers::DeframerVecBuffer::read",
 ];
 
@@ -70,7 +69,7 @@ fn runtimes() -> [Runtime; 2] {
     builders.each_mut().map(|builder| builder.enable_all().worker_threads(2).build().unwrap())
 }
 
-/// Makes a client, calls, drops both and the runtime, and judges what was given back.
+/// Makes a client, calls, drops both and the runtime, and judges the released blocks.
 fn judge<T>(
     name: &str,
     settings: impl Fn() -> ClientBuilder,

@@ -1,4 +1,4 @@
-//! Keys that a pool drew, whatever becomes of them.
+//! Tests keys that a pool drew, for each possible end of the keys.
 
 use std::time::Duration;
 
@@ -96,7 +96,7 @@ fn a_pool_shut_down_with_its_calls_in_flight() {
         |b| b,
         async |pool| {
             until(&pool, |status| status.asked > 0).await;
-            // Time for what comes at once, and for some that drips.
+            // The pause gives time for the keys that come at once, and for some that come slowly.
             tokio::time::sleep(Duration::from_millis(500)).await;
             assert!(pool.status().asked > 0);
         },

@@ -1,4 +1,4 @@
-//! An allocator that keeps what is given back to it, as it was given back, for a search.
+//! An allocator that keeps released blocks unchanged for a search.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
@@ -12,18 +12,18 @@ use crate::trace::Trace;
 pub(crate) struct Freed {
     address: usize,
     layout: Layout,
-    /// Who asked for it; not known of blocks from before the recording.
+    /// The stack of the allocation; unknown for blocks from before the recording.
     pub(crate) born: Option<Trace>,
-    /// Who gave it back.
+    /// The stack of the release.
     pub(crate) died: Trace,
 }
 
 impl Freed {
-    /// What it held when it was given back.
+    /// Returns the content of the block at its release.
     pub(crate) fn bytes(&self) -> Vec<u8> {
         let block = std::ptr::slice_from_raw_parts(self.address as *const u8, self.layout.size());
-        // SAFETY: the block is that long, was zeroed when it was made during the recording, and is
-        // nobody's but this value's.
+        // SAFETY: the block has this length, was zeroed when it was allocated during the recording, and belongs only to
+        // this value.
         unsafe { &*block }.to_vec()
     }
 }
@@ -35,8 +35,8 @@ impl Drop for Freed {
     }
 }
 
-/// To be held by each test from its start to its end: all threads are recorded, and what one test
-/// searches for is in another one's memory.
+/// Returns a lock that each test holds from its start to its end: all threads are recorded, and the search of one test
+/// would find the keys of another in memory.
 pub(crate) fn turn() -> MutexGuard<'static, ()> {
     static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
     ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner)
@@ -107,16 +107,16 @@ struct Quarantine;
 #[global_allocator]
 static QUARANTINE: Quarantine = Quarantine;
 
-// SAFETY: blocks come from `System` with the layout asked for, and go back to it once, either at
-// once or when their `Freed` is dropped. `realloc` is the trait's own: a new block, a copy, and the
-// old block given back, so that what growing leaves behind is seen too.
+// SAFETY: blocks come from `System` with the layout asked for. They go back to it once, either at once or when their
+// `Freed` is dropped. `realloc` is the trait's default: a new block, a copy, and the release of the old block, so that
+// the search also sees blocks that growing leaves behind.
 unsafe impl GlobalAlloc for Quarantine {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         if !RECORDING.load(Ordering::Relaxed) {
-            // SAFETY: the caller's promises are those `System` asks for.
+            // SAFETY: the caller fulfils the contract of `GlobalAlloc`, which is that of `System`.
             return unsafe { System.alloc(layout) };
         }
-        // Zeroed, so that what is found in a block was written by its owner.
+        // The block is zeroed, so that everything found in it was written by its owner.
         // SAFETY: as above.
         let block = unsafe { System.alloc_zeroed(layout) };
         if !block.is_null() {
@@ -141,18 +141,18 @@ unsafe impl GlobalAlloc for Quarantine {
                 return;
             }
         }
-        // SAFETY: the caller's promises are those asked for.
+        // SAFETY: the caller fulfils the contract of `GlobalAlloc`, which includes that of this function.
         unsafe { wipe_and_free(block, layout) }
     }
 }
 
-/// What a test searches for, its keys and its findings, is not to be found by the next one.
+/// Wipes and frees a block, so that the next test does not find this test's needles, keys and findings.
 ///
 /// # Safety
-/// The block is one of `System` with this layout, and nobody uses it any more.
+/// The block is one of `System` with this layout, and no code uses it any more.
 unsafe fn wipe_and_free(block: *mut u8, layout: Layout) {
     // SAFETY: the block is that long, and the caller's to give.
     unsafe { block.write_bytes(0, layout.size()) };
-    // SAFETY: the caller's promises are those `System` asks for.
+    // SAFETY: the caller fulfils this function's contract, which includes that of `System`.
     unsafe { System.dealloc(block, layout) }
 }

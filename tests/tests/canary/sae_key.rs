@@ -8,7 +8,7 @@ use crate::kmes::Kmes;
 use crate::search::Needles;
 use crate::{judge, quarantine};
 
-/// Where the secret number begins in a key of P-256 (RFC 5915): after version and tag.
+/// Returns the position of the secret number in a key of P-256 (RFC 5915): after version and tag.
 fn secret(der: &[u8]) -> usize {
     let before = [0x02, 0x01, 0x01, 0x04, 0x20];
     der.windows(5).position(|window| window == before).unwrap() + 5

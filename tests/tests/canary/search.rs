@@ -34,7 +34,7 @@ impl Needles {
         }
     }
 
-    /// How many pieces are in `bytes`.
+    /// Returns how many pieces are in `bytes`.
     pub(crate) fn count(&self, bytes: &[u8]) -> usize {
         let is_piece = |at: &&[u8]| self.starts[start(at)] && self.pieces.contains(*at);
         bytes.windows(PIECE).filter(is_piece).count()
@@ -45,16 +45,16 @@ fn start(piece: &[u8]) -> usize {
     usize::from(piece[0]) << 8 | usize::from(piece[1])
 }
 
-/// Where blocks with pieces of keys were asked for: how many blocks, how many pieces.
+/// The sites that allocated blocks with pieces of keys, with the number of blocks and of pieces.
 #[derive(Default)]
 pub(crate) struct Sites(pub(crate) BTreeMap<String, Found>);
 
-/// What was found of one site.
+/// The findings of one site.
 #[derive(Default)]
 pub(crate) struct Found {
     pub(crate) blocks: usize,
     pub(crate) pieces: usize,
-    /// The stacks of the first block: who asked for it, and who gave it back.
+    /// The stacks of the first block: its allocation and its release.
     pub(crate) stacks: String,
 }
 

@@ -1,4 +1,4 @@
-//! Counts what this thread allocates, in Rust and in C.
+//! Counts the allocations of this thread, in Rust and in C.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
@@ -21,7 +21,7 @@ thread_local! {
     static C: Cell<usize> = const { Cell::new(0) };
 }
 
-/// Runs `work` and says what it allocated.
+/// Runs `work`, and returns its result and its allocations.
 pub(crate) fn allocations<T>(work: impl FnOnce() -> T) -> (T, Allocations) {
     let before = (RUST.get(), C.get());
     let result = work();
@@ -37,7 +37,7 @@ static COUNTING: Counting = Counting;
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         RUST.set(RUST.get() + 1);
-        // SAFETY: the caller's promises are those `System` asks for.
+        // SAFETY: the caller fulfils the contract of `GlobalAlloc`, which is that of `System`.
         unsafe { System.alloc(layout) }
     }
 
@@ -73,8 +73,8 @@ mod c {
         fn __libc_realloc(block: *mut c_void, size: usize) -> *mut c_void;
     }
 
-    // SAFETY: glibc allows a program to replace its allocator's functions, and what these return
-    // is from glibc's own, so that its `free` takes it.
+    // SAFETY: glibc allows a program to replace its allocator's functions. The pointers that these return come from
+    // glibc's own allocator, so its `free` accepts them.
     #[unsafe(no_mangle)]
     extern "C" fn malloc(size: usize) -> *mut c_void {
         C.set(C.get() + 1);

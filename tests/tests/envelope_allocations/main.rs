@@ -177,7 +177,7 @@ fn an_allocation_would_have_been_counted() {
     assert_eq!(key.rust, 1);
     if cfg!(all(target_os = "linux", target_env = "gnu")) {
         assert_eq!((boxed.c, key.c), (1, 1));
-        // Its key schedule lives on the C side.
+        // The key schedule of AWS-LC is in C memory.
         let (_, key) = allocations(|| AwsLc::new(&[1; 32]));
         assert!(key.c > key.rust, "{key:?}");
     }

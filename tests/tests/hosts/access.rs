@@ -1,5 +1,5 @@
-//! Access rules between two hosts as real processes: what a rule denies never arrives, what it allows all does, and a
-//! daemon takes rules that changed without a restart.
+//! Tests access rules between two hosts as real processes: denied messages never arrive, allowed ones all do, and a
+//! daemon takes over changed rules without a restart.
 
 mod flooded;
 mod limits;
@@ -31,7 +31,7 @@ use super::{
     process::{PATIENCE, until},
 };
 
-/// What a robot lets its base station do. `PEER` is replaced.
+/// The rights that a robot gives its base station. `PEER` is replaced.
 const ROBOT: &str = r#"
 default = "deny"
 
@@ -61,7 +61,7 @@ struct Hosts {
     base: Host,
     peer: &'static str,
     rules: PathBuf,
-    /// Where the robot's daemon is, whatever its rules are.
+    /// The address of the robot's daemon, which its rules do not change.
     place: DaemonLocation,
     _keys: tempfile::TempDir,
 }
@@ -109,7 +109,7 @@ impl Hosts {
         daemon_reload_at(&self.place).unwrap()
     }
 
-    /// Whether a host shows this as denied, with this text somewhere in the reason.
+    /// Returns whether a host shows this as denied, with this text in the reason.
     fn shows(host: &Host, what: &str, why: &str) -> bool {
         host.link().denied.get(what).is_some_and(|reason| reason.contains(why))
     }
@@ -163,7 +163,7 @@ fn the_wrong_topic_never_arrives_and_the_right_one_does_in_each_mode() {
             mode.send_response(asked.publisher, asked.sequence, b"done").unwrap();
             let response = sets.recv_response(&mut bytes, Some(PATIENCE)).expect("a response");
             assert_eq!((response.sequence, &*bytes), (number, &b"done"[..]));
-            // All that was allowed is here: what was sent before it and is not here does not come.
+            // All allowed messages are here. A denied message that was sent before them would be here, too.
             assert!(!brake.has_data() && !secrets.has_data());
             assert!(reboot.recv_request(&mut bytes, Some(Duration::ZERO)).is_err());
             assert!(brake.matched().is_empty() && secrets.matched().is_empty());
@@ -235,7 +235,7 @@ fn a_daemon_takes_rules_that_changed_and_refuses_those_that_are_wrong() {
     hosts.write(ROBOT);
 }
 
-/// How often an endpoint was matched, and how often its QoS was incompatible.
+/// Returns how often an endpoint was matched, and how often its QoS was incompatible.
 fn events(matched: &Event, incompatible: &Event) -> (u64, u64) {
     let (EventStatus::Matched(matched), EventStatus::IncompatibleQos(incompatible)) =
         (matched.take(), incompatible.take())
@@ -275,11 +275,11 @@ fn denied_remote_endpoint_is_visible_and_never_matched() {
                 Hosts::shows(&hosts.robot, &format!("{verb} /scan (the peer's)"), "denied")
                     && Hosts::shows(&hosts.base, &format!("{verb} /scan (ours)"), "denied")
             });
-            // What was created later is matched: the others would be by now.
+            // Endpoints that were created later are matched: the others would be by now.
             meet(&publisher(from, "/other"), &subscription(to, "/other"));
             assert!(scan.matched().is_empty() && scans.matched().is_empty(), "{closed}");
             assert!(!client.is_available(), "{closed}");
-            // The robot shows what it has: it denies the use alone.
+            // The robot shows its endpoints: it denies only their use.
             let own = if std::ptr::eq(from, &here) { scan.gid() } else { scans.gid() };
             until("the base sees the robot's endpoint", || {
                 there.graph().endpoints.contains_key(&own)

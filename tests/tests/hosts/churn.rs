@@ -1,7 +1,7 @@
-//! A pinned peer that makes and drops a thousand endpoints a second, beside the samples of another host.
+//! Tests a pinned peer that creates and drops a thousand endpoints a second, beside the samples of another host.
 //!
-//! What it does to the age of those samples is printed:
-//! `cargo test --release -p axon-tests --test hosts -- --nocapture churn`.
+//! The test prints the effect on the age of those samples: `cargo test --release -p axon-tests --test hosts --
+//! --nocapture churn`.
 
 use std::{
     sync::atomic::{AtomicU64, Ordering::Relaxed},
@@ -27,18 +27,19 @@ use super::{
 /// Samples in each round, and the time from one to the next.
 const SAMPLES: u64 = 1000;
 const PACE: Duration = Duration::from_millis(3);
-/// Endpoints that are made, and as many that are dropped, at a time, and the time from one to the next: 1,000 a second.
+/// Number of endpoints that are created, and dropped, at a time, and the time between two changes: 1,000 endpoints a
+/// second.
 const AT_A_TIME: u32 = 10;
 const TICK: Duration = Duration::from_millis(10);
-/// What the peer's endpoints match here in the rounds in which they do.
+/// The topic of the peer's endpoints in the rounds in which they match a reader here.
 const READ: &str = "/read";
 
-/// What the peer does meanwhile.
+/// The peer's behaviour meanwhile.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Peer {
-    /// Nothing.
+    /// The peer does nothing.
     Quiet,
-    /// Its endpoints are of topics that nobody reads.
+    /// The peer's endpoints are of topics without a reader.
     Unmatched,
     /// Each of its endpoints is a publisher of a topic that somebody reads.
     Matched,
@@ -53,7 +54,7 @@ struct Churn {
 }
 
 impl Churn {
-    /// Drops the endpoints that it has, and makes as many.
+    /// Drops the current endpoints, and creates as many new ones.
     fn turn(&mut self, camera: &Camera, peer: Peer) {
         let endpoint = |number: u32| {
             let topic = match peer {
@@ -84,7 +85,7 @@ fn ages(publisher: &Publisher, subscription: &Subscription, taken: &AtomicU64) -
             let ages = (0..SAMPLES).map(|_| {
                 subscription.recv(&mut bytes, Some(PATIENCE)).expect("a sample");
                 let sent = u64::from_ne_bytes(bytes[..].try_into().expect("eight bytes"));
-                // Relaxed: nothing else is told by it.
+                // Relaxed: the counter orders nothing else.
                 taken.fetch_add(1, Relaxed);
                 epoch.elapsed().saturating_sub(Duration::from_nanos(sent))
             });
@@ -140,7 +141,7 @@ fn thousand_endpoints_a_second_hold_up_no_sample_of_another_host() {
         );
         assert_eq!(taken.load(Relaxed), SAMPLES, "{peer:?}: every sample comes");
         assert!(turns > 10 || peer == Peer::Quiet, "{peer:?}: the peer had {turns} turns");
-        // All that it made was followed, and what it dropped is gone.
+        // The host has followed all new endpoints, and the dropped ones are gone.
         let of_peer = || -> Vec<Gid> {
             let graph = reader.graph();
             graph.endpoints.keys().copied().filter(|gid| gid.is_of(&churn.session)).collect()

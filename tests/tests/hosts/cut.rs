@@ -66,9 +66,8 @@ fn in_messages10_a_link_flows_again_soon_after_its_path_is_back() {
     flows_again([0, 1].map(|host| kmes.settings(host, &[("AXON_QKD_KEY_MODE", "messages10")])));
 }
 
-/// A daemon may have something to say during a cut, for example that a window has grown: it notices the
-/// cut, and the successor that it dials is none too many. Such a cut says nothing of the rule, and is made
-/// again.
+/// A daemon may have data to send during a cut, for example a larger window. It then notices the cut, and rightly dials
+/// a successor. Such a cut proves nothing about the rule, so the test repeats it.
 #[test]
 fn an_unnoticed_cut_creates_no_second_link() {
     let (hosts, wire) = wired([classic(&[]), classic(&[])]);

@@ -11,7 +11,8 @@ use super::{
 
 const MESSAGES: u64 = 300;
 
-/// `count` messages from the first host to both; both hosts say what they agreed on.
+/// Delivers `MESSAGES` messages from the first host to both. Checks that both hosts show the negotiated key exchange
+/// and cipher.
 fn deliver(settings: [Settings; 2], key_exchange: &str, cipher: &str) -> [Host; 2] {
     let hosts = Plan::new(settings).start();
     let [a, b] = &hosts;

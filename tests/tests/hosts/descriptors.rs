@@ -18,7 +18,7 @@ fn session_that_another_host_uses_takes_no_further_descriptor_of_its_daemon() {
     let spec = || EndpointSpec::new("/descriptors", "test/Bytes", Qos::default());
     let hosts = Plan::new([classic(&[]), classic(&[])]).start();
     let sessions: Vec<_> = (0..SESSIONS).map(|_| hosts[0].session("publisher")).collect();
-    // What the link itself takes is open by the time that the first session's publisher is heard.
+    // The descriptors of the link itself are open once the first session's publisher is matched.
     let first = sessions[0].create_publisher(spec()).unwrap();
     let subscription = hosts[1].session("subscriber").create_subscription(spec()).unwrap();
     assert!(subscription.wait_matched(1, PATIENCE) && first.wait_matched(1, PATIENCE));

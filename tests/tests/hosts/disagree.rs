@@ -55,7 +55,7 @@ fn a_failed_proof_retires_that_key_on_both_hosts_and_nothing_else() {
     }
 }
 
-/// Of every answer by name that host B gets, the first key is wrong.
+/// The first key of every answer by name that host B gets is wrong.
 #[test]
 fn kmes_that_disagree_about_the_first_keys_cost_few_of_them() {
     let kmes = Kmes::start();

@@ -1,4 +1,5 @@
-//! What is dropped on the way to another host is counted and logged by topic where it is dropped.
+//! Tests that samples that are dropped on the way to another host are counted and logged by topic where they are
+//! dropped.
 
 use std::{thread, time::Instant};
 
@@ -24,7 +25,7 @@ fn across(hosts: &[Host; 2], topic: &str, qos: Qos) -> (Publisher, Subscription)
     (publisher, subscription)
 }
 
-/// Samples of a topic that the host says it dropped for this cause.
+/// Returns how many samples of a topic the host reports as dropped for this cause.
 fn dropped(host: &Host, topic: &str, cause: &str) -> u64 {
     let topics = host.status().topics;
     let of = topics.iter().filter(|of| of.topic == topic);
@@ -56,7 +57,7 @@ fn samples_that_a_slow_peer_is_spared_are_counted_by_topic() {
     let (quiet, reads) = across(&hosts, "/quiet", Qos::keep_all());
     let there = hosts[1].status().pid;
     signal(there, Signal::STOP);
-    // Nothing of the other host is asked meanwhile: it cannot answer.
+    // The test asks the other host nothing meanwhile, because it cannot answer.
     let bytes = vec![0x5a; 300_000];
     until("samples are dropped", || {
         for publisher in [&newest, &lossy] {
@@ -69,7 +70,7 @@ fn samples_that_a_slow_peer_is_spared_are_counted_by_topic() {
     hosts[0].wait_log(&["WARN", "samples are dropped", "samples="]);
     quiet.publish(b"one").unwrap();
     assert!(reads.recv(&mut Vec::new(), Some(PATIENCE)).is_ok());
-    // What the link says is the sum of its topics, once both are told.
+    // The counts of the link are the sums over its topics, once both are reported.
     until("the counts agree", || {
         ["queue", "late"].iter().all(|cause| {
             let topics = ["/newest", "/lossy", "/quiet"].map(|t| dropped(&hosts[0], t, cause));
@@ -122,7 +123,8 @@ fn samples_of_a_route_that_ended_are_counted_by_topic() {
         let topic = format!("/ends_{tries}");
         let (publisher, subscription) = across(&hosts, &topic, Qos::default());
         thread::scope(|scope| {
-            // Until the subscription's end is known here: what is sent meanwhile has no route there.
+            // The loop runs until the subscription's end is known here: samples that are sent meanwhile have no route
+            // there.
             let flood = scope.spawn(|| {
                 let end = Instant::now() + PATIENCE;
                 while !publisher.matched().is_empty() {

@@ -1,5 +1,5 @@
-//! Several connections between the same daemons: which one is the link, whatever the network does to the
-//! order of what is said on them.
+//! Tests several connections between the same daemons: which one becomes the link, for any order in which the network
+//! delivers their messages.
 
 use std::net::SocketAddr;
 
@@ -45,7 +45,7 @@ impl Elector {
         self.try_meet().expect("HELLO")
     }
 
-    /// As [`meet`](Self::meet), or why the host closed the connection.
+    /// Connects like [`meet`](Self::meet), or returns the reason why the host closed the connection.
     fn try_meet(&self) -> Result<Met, String> {
         let to = SocketAddr::from((self.host.address, self.host.status().port.unwrap()));
         let claim = Claim { host: "elector", daemon: DaemonId([0; 16]), auth: 0 };
@@ -57,7 +57,7 @@ impl Elector {
         self.stranger.say(met, &LinkMessage::Elected(elected));
     }
 
-    /// Until the host says its graph on it, as it does first on a link.
+    /// Waits until the host sends its graph on the connection, the first message on a link.
     fn linked(&self, met: &mut Met) {
         let whole =
             |m: &LinkMessage| matches!(m, LinkMessage::Graph(GraphUpdate { before: 0, .. }));
@@ -74,7 +74,7 @@ impl Elector {
         (first, last)
     }
 
-    /// Says a whole graph: the subscription for which routes are asked.
+    /// Sends a whole graph: the subscription for which routes are requested.
     fn say_subscription(&self, met: &mut Met) {
         let subscription = Endpoint::new(SUBSCRIPTION, EndpointKind::Subscription, TOPIC, TYPE)
             .with_node("one", "/");
@@ -82,7 +82,7 @@ impl Elector {
         self.stranger.say(met, &LinkMessage::Graph(graph));
     }
 
-    /// Says a whole graph of 600 publishers in two parts; the last is of the topic.
+    /// Sends a whole graph of 600 publishers in two parts; the last publisher is of the topic.
     fn say_graph(&self, met: &mut Met, version: u64) {
         let publisher = |number: u16| {
             Endpoint::new(
@@ -132,13 +132,13 @@ fn the_last_elected_stands_when_it_is_heard_of_first() {
     elector.elect(&mut last, 2);
     elector.linked(&mut last);
     elector.elect(&mut first, 1);
-    // What was sent over it before is read.
+    // The host reads data that was sent over the link before.
     elector.stranger.open(&first).expect("room for a stream");
     let why = elector.stranger.closed(&first);
     assert!(why.contains("a successor took over"), "{why}");
     assert_eq!(last.connection.close_reason(), None);
     assert_eq!(elector.links(), 1);
-    // It is the link still: what is asked on it is answered.
+    // The connection is still the link: a request on it is answered.
     elector.stranger.say(&mut last, &LinkMessage::GraphResync(GraphResync { version: 0 }));
     elector.linked(&mut last);
 }
@@ -173,7 +173,7 @@ fn lost_end_of_a_route_is_made_up_by_the_next_link() {
     let mut link = elector.meet();
     elector.elect(&mut link, 1);
     elector.linked(&mut link);
-    // Whose range nobody knows is matched with nobody.
+    // A subscription of unknown range is matched with no publisher.
     elector.say_subscription(&mut link);
     elector.subscribe(&mut link, 1);
     until("the route is read", || publisher.matched().len() == 1);
@@ -187,7 +187,7 @@ fn lost_end_of_a_route_is_made_up_by_the_next_link() {
     elector.stranger.hear(&mut next, ready).expect("the route");
     assert_eq!(publisher.matched().len(), 1);
 
-    // And that of 2: nothing is asked for before the graph is said.
+    // UNSUBSCRIBE of 2 was lost, too: the peer requests no route before it has sent its graph.
     let mut last = elector.meet();
     elector.elect(&mut last, 3);
     elector.linked(&mut last);
@@ -206,7 +206,7 @@ fn one_peer_has_so_many_connections_and_leaves_room_for_others() {
         Err(why) => why,
     };
     assert!(why.contains("as many connections as it may"), "{why}");
-    // Those that it has, it has; and who is somebody else is not kept out.
+    // The existing connections stay, and a peer with another identity is not kept out.
     elector.elect(&mut met[7], 1);
     elector.linked(&mut met[7]);
     let other = Elector { auth: Auth::None(SigningKey::generate().unwrap()), ..elector };

@@ -37,7 +37,7 @@ fn publish(publisher: &Publisher, samples: u64) {
     }
 }
 
-/// The numbers of what comes, to the last that must.
+/// Returns the numbers of the samples that arrive, up to the number `last`.
 pub(crate) fn take(subscription: &Subscription, last: u64) -> Vec<u64> {
     let (mut bytes, mut numbers) = (Vec::new(), Vec::new());
     while numbers.last() != Some(&last) {
@@ -62,7 +62,7 @@ fn what_a_publisher_leaves_arrives(settings: [Settings; 2]) {
     drop(publisher);
     assert!(reader.join().unwrap().into_iter().eq(1..=SAMPLES));
     assert_eq!(lost(&hosts[0], "publisher_ended"), 0);
-    // Nobody shows it any more.
+    // No host shows the publisher any more.
     until("its end is known there", || {
         hosts[1].status().topics.iter().all(|topic| topic.remote_publishers == 0)
     });

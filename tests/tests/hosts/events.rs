@@ -1,4 +1,4 @@
-//! What endpoints of two hosts report of each other: the eleven events, at both ends, and lifespan.
+//! Tests the events that endpoints of two hosts report about each other: the eleven events, at both ends, and lifespan.
 
 use std::{
     sync::atomic::{AtomicBool, Ordering},
@@ -157,7 +157,7 @@ fn every_sample_is_taken_or_counted_as_lost_elsewhere() {
     let qos = Qos::keep_all().with_reliability(Reliability::BestEffort);
     let (publisher, subscription) = matched(&here, &there, qos);
     let lost = subscription.event(EventKind::MessageLost).unwrap();
-    // What is lost is missed from the first one on that came.
+    // Losses count from the first sample that arrived.
     publisher.publish(b"first").unwrap();
     let (mut bytes, mut taken) = (Vec::new(), 1);
     assert!(subscription.recv(&mut bytes, Some(PATIENCE)).is_ok());
@@ -168,7 +168,7 @@ fn every_sample_is_taken_or_counted_as_lost_elsewhere() {
     }
     loop {
         let Ok(info) = subscription.recv(&mut bytes, Some(Duration::from_millis(50))) else {
-            // What was dropped last is missed when the next one comes.
+            // Samples that were dropped last count as lost when the next sample arrives.
             publisher.publish(&[7; 5000]).unwrap();
             continue;
         };
@@ -203,13 +203,13 @@ fn samples_older_than_their_lifespan_are_not_taken_on_another_host() {
     let lasts = |seconds| {
         Qos::default().with_durability(Durability::TransientLocal).with_lifespan(seconds * SECOND)
     };
-    // By the clock of its host it is of 1970: the clock does not matter.
+    // By its timestamp the sample is of 1970: the timestamp does not matter.
     let (publisher, subscription) = matched(&here, &there, lasts(3600));
     publisher.publish_at(from_unix_nanos(1_000_000_000), b"new").unwrap();
     let mut bytes = Vec::new();
     let info = subscription.recv(&mut bytes, Some(PATIENCE)).expect("it is not old");
     assert_eq!((&bytes[..], info.sequence, subscription.lost()), (&b"new"[..], 1, 0));
-    // By its clock this one is of 2262. It is four seconds old when it leaves, and these count.
+    // By its timestamp this sample is of 2262. It is four seconds old when it leaves, and that age counts.
     let spec = || EndpointSpec::new("/late", "test/Bytes", lasts(6));
     let late = here.create_publisher(spec()).unwrap();
     let over = Instant::now() + Duration::from_secs(6);
@@ -236,7 +236,7 @@ fn asserted_liveliness_without_a_sample_reaches_the_other_host() {
     let liveliness = subscription.event(EventKind::LivelinessChanged).unwrap();
     let lost = publisher.event(EventKind::LivelinessLost).unwrap();
     becomes(&there, &liveliness, true);
-    // It says nothing, though its process and the link live.
+    // The publisher asserts nothing, though its process and the link live.
     becomes(&there, &liveliness, false);
     occurs(&here, &lost);
     let enough = AtomicBool::new(false);
@@ -251,7 +251,7 @@ fn asserted_liveliness_without_a_sample_reaches_the_other_host() {
         enough.store(true, Ordering::Relaxed);
     });
     becomes(&there, &liveliness, false);
-    // A sample says it as well.
+    // A sample asserts liveliness as well.
     publisher.publish(b"x").unwrap();
     becomes(&there, &liveliness, true);
     assert_eq!(publisher.matched(), [subscription.gid()], "it is no reason to part");

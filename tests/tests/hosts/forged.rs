@@ -35,12 +35,12 @@ struct Forger {
 /// The daemon in whose name something is forged, once it is known.
 type Name = Arc<Mutex<Option<DaemonId>>>;
 
-/// What is forged, with `AXON_CLASSIC_AUTH` as beacons have it.
+/// The kind of forgery, with `AXON_CLASSIC_AUTH` as beacons contain it.
 #[derive(Clone)]
 enum Forged {
     /// Beacons of daemons that there are not.
     MadeUp(u8),
-    /// The same, each from an address of its own.
+    /// The same beacons, each from an address of its own.
     Scattered(u8),
     /// Beacons of a real daemon, from addresses where it is not.
     Beacons(u8, Name),
@@ -97,7 +97,7 @@ impl Forger {
         let (until, count) = (Arc::clone(&over), Arc::clone(&sent));
         let thread = thread::spawn(move || {
             let begin = Instant::now();
-            // Relaxed: nothing else is told by it.
+            // Relaxed: the flag orders nothing else.
             while !until.load(Ordering::Relaxed) {
                 let number = count.fetch_add(1, Ordering::Relaxed);
                 let scattered = sources.is_empty().then(|| {
@@ -109,7 +109,7 @@ impl Forger {
                 let address = source.local_addr().unwrap();
                 if let Some(datagram) = forged.datagram(domain, number, address) {
                     for target in targets {
-                        // An error: nobody is there yet.
+                        // An error means that no socket is bound there yet.
                         let _ = source.send_to(&datagram.encode(), target);
                     }
                 }
@@ -135,7 +135,7 @@ impl Drop for Forger {
     }
 }
 
-/// Whether each has a link with the other's daemon as it is now.
+/// Returns whether each host has a link with the other's current daemon.
 fn linked(hosts: &[Host; 2]) -> bool {
     let [a, b] = hosts.each_ref().map(Host::status);
     let has = |one: &Status, other: &Status| one.links.iter().any(|l| l.peer == other.daemon);
@@ -157,8 +157,8 @@ fn id_of(host: &Host) -> DaemonId {
     DaemonId(std::array::from_fn(byte))
 }
 
-/// Starts both hosts, then the first one anew. Each time they link before the forger, which goes on from now on
-/// in the second one's name, has sent so many more datagrams.
+/// Starts both hosts, then restarts the first one. Each time they must link before the forger has sent `most` more
+/// datagrams. The forger goes on from now on in the second host's name.
 fn link(what: &str, hosts: &mut [Host; 2], name: &Name, most: u64, sent: impl Fn() -> u64) {
     for again in [false, true] {
         if again {
@@ -203,10 +203,10 @@ fn link_through_forged(plan: impl Fn([Settings; 2]) -> Plan) {
             Forged::MadeUp(_) | Forged::Scattered(_) => Name::default(),
             Forged::Beacons(_, name) | Forged::Goodbyes(name) => Arc::clone(name),
         };
-        // As many as come in three seconds.
+        // The limit is the number of datagrams in three seconds.
         let sent = || forger.sent.load(Ordering::Relaxed);
         link(what, &mut hosts, &name, 3 * u64::from(a_second), sent);
-        // What is forged takes nothing from a link that stands.
+        // Forged datagrams take nothing from a link that stands.
         forger.wait_for(u64::from(a_second));
         let since = hosts[0].link().since;
         let (begin, before) = (Instant::now(), hosts.each_ref().map(processor_time));

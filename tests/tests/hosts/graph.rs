@@ -21,7 +21,7 @@ fn hosts() -> [Host; 2] {
     Plan::new([classic(&[]), classic(&[])]).start()
 }
 
-/// A session, and the node that is told of changes.
+/// A session, and its node, which gets the changes of the graph.
 struct Witness {
     session: Session,
     node: Node,
@@ -44,7 +44,7 @@ impl Witness {
         }
     }
 
-    /// What the graph has besides the node itself.
+    /// Returns the endpoints of the graph without those of the node itself.
     fn others(graph: &GraphView) -> Vec<&Endpoint> {
         let all = graph.endpoints.values().map(|entry| &*entry.endpoint);
         all.filter(|endpoint| endpoint.node != "witness").collect()
@@ -73,7 +73,7 @@ fn the_remote_graph_shows_every_endpoint_field_while_the_endpoint_exists() {
     let session = a.session("everything");
     let daemon = session.daemon();
     let mut expected: Vec<Endpoint> = Vec::new();
-    // One after another, so that each has to be told of.
+    // The endpoints appear one after another, so that each must be announced.
     let appears = |expected: &mut Vec<Endpoint>, new: Endpoint| {
         let gid = new.gid;
         expected.push(new);
@@ -117,7 +117,7 @@ fn the_remote_graph_shows_every_endpoint_field_while_the_endpoint_exists() {
     appears(&mut expected, of(&left, server.gid(), EndpointKind::Server, "/c", 3, few));
     let client = right.create_client(spec("/d", 4, odd())).unwrap();
     appears(&mut expected, of(&right, client.gid(), EndpointKind::Client, "/d", 4, odd()));
-    // One of no node, of a type that nobody knows more of.
+    // This endpoint has no node, and a type without a name and a hash.
     let bare = session.create_publisher(EndpointSpec::new("/e", "", Qos::default())).unwrap();
     let unknown = {
         let mut endpoint = of(&left, bare.gid(), EndpointKind::Publisher, "/e", 5, Qos::default());

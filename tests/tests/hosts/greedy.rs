@@ -31,9 +31,9 @@ use super::{
 const MANY: u32 = 12_000;
 /// In one message: it is 4 MiB at most before it is compressed.
 const PART: u32 = 1_800;
-/// What counts for each of them at least.
+/// Minimum number of bytes that count for each endpoint.
 const NAMES: usize = 2_000;
-/// What the graph of one peer may take.
+/// Bound of one peer's graph, in bytes.
 const BOUND: usize = 16 << 20;
 
 /// Two hosts that know each other, and a peer that A's trust file knows as "camera".
@@ -50,7 +50,7 @@ impl Camera {
         Self::under("")
     }
 
-    /// As [`new`](Self::new), where host A has these access rules, if any.
+    /// Starts as [`new`](Self::new) does, but host A has these access rules, if any.
     pub(crate) fn under(rules: &str) -> Self {
         let dir = tempfile::tempdir().unwrap();
         let mut settings = pinned(dir.path(), [[false, true], [true, false]]);
@@ -73,7 +73,7 @@ impl Camera {
         Self { stranger: Stranger::new(), auth, a, b, dir }
     }
 
-    /// Has host A read these access rules.
+    /// Makes host A read these access rules.
     pub(crate) fn set_rules(&self, rules: &str) {
         fs::write(self.dir.path().join("access.toml"), rules).unwrap();
         let report = daemon_reload_at(&DaemonLocation::from(&self.a.config())).unwrap();
@@ -85,7 +85,7 @@ impl Camera {
         self.stranger.dial(&self.a, &self.auth, &claim).expect("a link")
     }
 
-    /// Announces so many endpoints as a whole graph.
+    /// Announces `count` endpoints as a whole graph.
     fn announce(&self, met: &mut Met, session: SessionId, count: u32) {
         for from in (0..count).step_by(PART as usize) {
             let to = count.min(from + PART);
@@ -97,7 +97,7 @@ impl Camera {
         }
     }
 
-    /// Waits until all that was said on the link was heard.
+    /// Waits until the host has handled all earlier messages on the link.
     fn heard(&self, met: &mut Met, route: u32) {
         let topic = format!("/asked_{route}");
         self.stranger.say(met, &subscribe(route, topic, Vec::new()));
@@ -166,9 +166,9 @@ fn short(session: SessionId, number: u32, topic: &str) -> Endpoint {
     }
 }
 
-/// While a graph is loaded host A's daemon tells its status, and a stream of host B goes on: for each part of the graph there
-/// is a sample at least. How long either pauses at most, the simulator says, in `unfair/floods.rs`: here a status names
-/// thousands of endpoints, and takes as long as the machine is slow.
+/// Loads a graph. Meanwhile host A's daemon answers status requests, and a stream of host B goes on: at least one
+/// sample for each part of the graph. The simulator limits the pauses of either, in `unfair/floods.rs`. This test
+/// cannot, because a status names thousands of endpoints and takes longer on a slow machine.
 fn serves_others(camera: &Camera, there: &mut Node, load: impl FnOnce()) {
     let over = AtomicBool::new(false);
     let (mut answers, mut longest) = (0_u32, Duration::ZERO);
@@ -176,11 +176,11 @@ fn serves_others(camera: &Camera, there: &mut Node, load: impl FnOnce()) {
     thread::scope(|scope| {
         let (camera, over, answers, longest) = (&camera, &over, &mut answers, &mut longest);
         scope.spawn(move || {
-            // Relaxed: nothing else is told by it.
+            // Relaxed: the flag orders nothing else.
             while !over.load(Relaxed) {
                 let begin = Instant::now();
                 let status = camera.a.try_status();
-                // One that comes after the end says nothing.
+                // A status that comes after the end proves nothing.
                 if status.is_some() && !over.load(Relaxed) {
                     (*answers, *longest) = (*answers + 1, (*longest).max(begin.elapsed()));
                 }
@@ -262,13 +262,13 @@ fn graph_is_bounded_for_all_daemon_ids_of_a_peer_and_the_link_stays() {
 
 #[test]
 fn graph_change_floods_block_no_session_and_end_in_the_newest_state() {
-    /// The flood is under way once so many are said: more than is on its way at a time.
+    /// The flood is under way after this many changes: more than are in flight at a time.
     const BEFORE: u64 = 30_000;
-    /// Others match before the flooder has said so many more.
+    /// Other endpoints match before the flooder has sent this many more.
     const MEANWHILE: u64 = 60_000;
-    /// How often others get on while the flood does.
+    /// Number of rounds in which others make progress during the flood.
     const ROUNDS: u32 = 20;
-    /// From change to change: 25,000 a second, where a daemon takes 16,384.
+    /// Time between two changes: 25,000 a second, where a daemon takes 16,384.
     const AT_A_TIME: Duration = Duration::from_micros(40);
     let camera = Camera::new();
     let mut there = camera.a.subscribe(Sizes::Small);
@@ -279,7 +279,7 @@ fn graph_change_floods_block_no_session_and_end_in_the_newest_state() {
     let key = SessionKey::generate().unwrap();
     let session = key.id();
     camera.stranger.prove(&mut link, DaemonId([0xff; 16]), &[&key]);
-    // Every second time it is what somebody reads, so that the daemon has much to do about it.
+    // Every second change is of a topic with a reader, so that the daemon has much work with it.
     let topic = |version: u64| match version % 2 {
         0 => "/read".to_owned(),
         _ => format!("/changed_{version}"),
@@ -287,14 +287,14 @@ fn graph_change_floods_block_no_session_and_end_in_the_newest_state() {
     let spec = EndpointSpec::new("/read", "t", Qos::default());
     let _reads = reader.create_subscription(spec).unwrap();
     let (start, from) = (Instant::now(), camera.cpu());
-    // Relaxed: nothing else is told by them.
+    // Relaxed: they order nothing else.
     let (said, enough) = (AtomicU64::new(0), AtomicBool::new(false));
     let all = thread::scope(|scope| {
         let (camera, link, said, enough) = (&camera, &mut link, &said, &enough);
         let flood = scope.spawn(move || {
             let mut version = 0;
             let begun = Instant::now();
-            // Beyond the patience of those that wait, which fail: only so that the test ends.
+            // The limit exceeds the timeout of the waiting threads, which fail first: it only ends the test.
             while version % 2 == 1 || !enough.load(Relaxed) && begun.elapsed() < 4 * PATIENCE {
                 version += 1;
                 let before = version - 1;
@@ -302,8 +302,8 @@ fn graph_change_floods_block_no_session_and_end_in_the_newest_state() {
                 let graph = GraphUpdate { version, before, added, ..GraphUpdate::default() };
                 camera.stranger.say(link, &LinkMessage::Graph(graph));
                 said.store(version, Relaxed);
-                // More than the daemon takes, and no more than its socket does: QUIC closes a connection for many lost
-                // packets of a stream that nobody reads.
+                // The rate exceeds what the daemon handles, but not what its socket receives: QUIC closes a connection
+                // for many lost packets of a stream that is not read.
                 let due = AT_A_TIME * u32::try_from(version).expect("a number of a test");
                 if version.is_multiple_of(32) {
                     thread::sleep(due.saturating_sub(begun.elapsed()));
@@ -356,7 +356,7 @@ fn graph_change_floods_block_no_session_and_end_in_the_newest_state() {
         "{all} changes taken in {taken:?} with {:?} of the daemon's time and {version} changes told",
         camera.cpu() - from
     );
-    // What changed meanwhile was taken together: the daemon asked for few of the times that it was there.
+    // The daemon handled the changes in between together: it asked for few of the versions.
     camera.stranger.say(&mut link, &subscribe(1, "/asked".into(), Vec::new()));
     let asked = AtomicU64::new(0);
     let last = camera.stranger.hear(&mut link, |message| {
@@ -375,7 +375,7 @@ fn routes_beyond_the_limit_of_a_peer_are_refused_by_name() {
     let camera = Camera::new();
     let mut link = camera.link(0xff);
     let qos = Qos::default();
-    // Each says 4 MB at most; it is kept three times. Routes may take four times as much as a graph.
+    // Each announces at most 4 MB, of which three copies are kept. Routes may take four times as much as a graph.
     let key = SessionKey::generate().unwrap();
     camera.stranger.prove(&mut link, DaemonId([0xff; 16]), &[&key]);
     let readers: Vec<_> = (0..40_000)

@@ -1,4 +1,5 @@
-//! What a KEEP_ALL, TRANSIENT_LOCAL publisher keeps for those that come later: all that its memory holds.
+//! Tests the history that a KEEP_ALL, TRANSIENT_LOCAL publisher keeps for late subscriptions: everything that fits its
+//! memory.
 
 use axon_transport::{
     EndpointSpec, Publisher, Subscription,
@@ -47,7 +48,7 @@ fn a_late_joiner_gets_twenty_thousand_small_samples_on_each_host() {
     publish(&publisher, 1..=SAMPLES);
     let _here = joins_late(&hosts[0], 1..=SAMPLES);
     let _there = joins_late(&hosts[1], 1..=SAMPLES);
-    // From what the other host has by then.
+    // This history comes from the samples that the other host already has.
     let _another = joins_late(&hosts[1], 1..=SAMPLES);
     assert!(publisher.wait_acknowledged(PATIENCE));
 }

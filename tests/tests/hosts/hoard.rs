@@ -1,4 +1,4 @@
-//! A pinned peer that sends what this host cannot read yet.
+//! Tests a pinned peer that sends data that this host cannot read yet.
 
 use std::time::Duration;
 
@@ -24,12 +24,12 @@ pub(crate) const TYPE: &str = "test/Bytes";
 /// Daemon ids of the peer, and data streams of each.
 const IDS: u8 = 4;
 const STREAMS: usize = 48;
-/// What it tries to send over each stream.
+/// Number of bytes that the peer tries to send over each stream.
 const BYTES: usize = 8 << 20;
-/// What of it the daemon may hold: 64 MiB of long messages that it reads and 16 MiB of short ones, and in QUIC's windows 64 MiB of all links and 1 MiB
-/// of each.
+/// Number of these bytes that the daemon may hold: 64 MiB of long messages in progress and 16 MiB of short ones, and in
+/// QUIC's windows 64 MiB of all links and 1 MiB of each.
 const STATED: usize = (64 + 16 + 64 + IDS as usize) << 20;
-/// With what a debug build's allocator and quinn add to each packet that waits: a fifth.
+/// The bound includes the overhead of a debug build's allocator and of quinn for each waiting packet: a fifth.
 const BOUND: usize = STATED + STATED / 5;
 
 /// Announces a publisher of the topic, and waits until it is subscribed to: the route.
@@ -112,7 +112,7 @@ fn incomplete_short_messages_are_bounded_for_a_peer_and_freed() {
         let route = all_published(&camera, &mut link, &topic, &publishers);
         links.push((link, route, publishers));
     }
-    // What the publishers take is there before.
+    // The memory of the publishers is allocated before.
     let before = camera.memory("VmRSS");
     let mut streams = Vec::new();
     for (link, route, publishers) in &links {
@@ -135,8 +135,8 @@ fn incomplete_short_messages_are_bounded_for_a_peer_and_freed() {
     let most = camera.memory("VmRSS").saturating_sub(before);
     let tried = SHORT_IDS as usize * PUBLISHERS as usize * (SAYS as usize - 1024);
     eprintln!("{} MiB of {} MiB in short messages", most >> 20, tried >> 20);
-    // 16 MiB of short messages that are being read, what the windows of all links let in, and what the daemon has for each
-    // of the streams.
+    // The bound is 16 MiB of short messages in progress, the windows of all links, and the daemon's memory for each
+    // stream.
     let stated = (16 + 64 + SHORT_IDS as usize) << 20;
     assert!(most < stated + stated / 5, "{most}");
     assert!(links.iter().all(|(link, ..)| link.connection.close_reason().is_none()));
@@ -147,13 +147,14 @@ fn incomplete_short_messages_are_bounded_for_a_peer_and_freed() {
 
 /// MiB that the samples and calls of a peer may take that are kept here for readers and servers.
 const HELD_MB: usize = 64;
-/// What else may come with them: messages on their way, and the rings themselves.
+/// Other memory that may come with the messages: those in flight, and the rings themselves.
 const BESIDE_MB: usize = 32;
 /// Publishers and clients of the peer, and messages of 1 MiB of each: three times as much as it may have here.
 const WRITERS: usize = 8;
 const MESSAGES: u64 = 24;
 
-/// Two hosts of which the first bounds what it keeps for the second, and what its daemon's shared memory is at first.
+/// Starts two hosts, the first of which limits the memory that it keeps for the second. Also returns the initial shared
+/// memory of its daemon.
 fn bounded() -> ([Host; 2], usize) {
     let held = HELD_MB.to_string();
     let hosts = Plan::new([classic(&[("AXON_LINK_HELD_MB", &held)]), classic(&[])]).start();
@@ -162,7 +163,7 @@ fn bounded() -> ([Host; 2], usize) {
     (hosts, before)
 }
 
-/// What the first host keeps for the second is within the bound, and most of what it may.
+/// Checks that the memory that the first host keeps for the second is within the bound, and near it.
 fn is_bounded(host: &Host, before: usize) {
     let of_link = || {
         let link = host.link();
@@ -204,7 +205,7 @@ fn history_that_is_delivered_is_bounded_for_a_peer_and_its_newest_is_kept() {
         }
     }
     is_bounded(&a, before);
-    // Who comes later gets the newest, as much as there is.
+    // A late reader gets the newest samples, as many as there are.
     let mut late = 0;
     for n in 0..WRITERS {
         let reader = here.create_subscription(latched(n)).unwrap();
@@ -240,7 +241,7 @@ fn untaken_requests_are_bounded_for_a_peer_without_loss() {
     }
     until("as much as may be is there", || a.link().held_bytes > (HELD_MB as u64) << 19);
     let mut bytes = Vec::new();
-    // What the peer asks another server is answered meanwhile.
+    // The peer's requests to another server are answered meanwhile.
     let number = other.send_request(b"now").unwrap();
     let asked = quick.recv_request(&mut bytes, Some(PATIENCE)).expect("a request");
     quick.send_response(asked.publisher, asked.sequence, b"done").unwrap();

@@ -85,7 +85,7 @@ fn to_udp(dice: &mut Dice, host: &Host) {
     }
     for datagram in &datagrams {
         for door in doors {
-            // Where there is no multicast route it cannot come from there either.
+            // Without a multicast route the datagram cannot come from there either.
             let _ = socket.send_to(datagram, SocketAddrV4::new(door.0, door.1));
         }
     }

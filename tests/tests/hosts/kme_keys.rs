@@ -1,8 +1,9 @@
-//! What the TLS connection to a KME leaves in the memory of a daemon: traffic secrets, and keys of its ciphers.
+//! Tests which secrets the TLS connection to a KME leaves in the memory of a daemon: traffic secrets, and keys of its
+//! ciphers.
 //!
-//! The KMEs run in this process, and their TLS library says the secrets (`KeyLog`). While a connection stands its secrets
-//! have to be somewhere: that they are found shows that the search works, and they are on no stack. Once it is closed as
-//! idle they are nowhere: heap, freed heap, stacks.
+//! The KMEs run in this process, and their TLS library reveals the secrets (`KeyLog`). While a connection stands its
+//! secrets must be in memory: that they are found shows that the search works. They are on no stack. Once the
+//! connection is closed as idle they are nowhere: neither in the heap, nor in freed heap, nor on stacks.
 
 use std::{
     collections::BTreeSet,
@@ -31,7 +32,7 @@ const QUIET: Duration = Duration::from_millis(200);
 /// Searches while a connection stands.
 const SEARCHES: usize = 5;
 
-/// All that TLS makes of the secrets of all connections so far.
+/// Returns all secrets that TLS derives from those of all connections so far.
 fn needles(kmes: &Kmes) -> Needles {
     let mut needles = Needles::default();
     for (number, (label, secret)) in kmes.tls_secrets().iter().enumerate() {

@@ -1,5 +1,5 @@
-//! A pinned peer whose samples have numbers that no publisher can have reached, or are far longer than what
-//! it sends.
+//! Tests a pinned peer whose samples have numbers that no publisher can have reached, or state a length far beyond the
+//! bytes that it sends.
 
 use axon_envelope::inner::Header;
 use axon_tests::Sizes;
@@ -42,7 +42,7 @@ impl Lies {
         (link, Self { publisher, bytes })
     }
 
-    /// Adds a sample that is said to have `length` bytes.
+    /// Adds a sample whose header states `length` bytes.
     fn add(&mut self, sequence: u64, compressed: bool, length: u32, payload: &[u8]) {
         let header = Header {
             gid: self.publisher.0,
@@ -109,8 +109,8 @@ fn highly_compressed_samples_arrive_in_order_without_delaying_other_topics() {
     assert_eq!(link.connection.close_reason(), None);
 }
 
-/// A peer publishes samples of these numbers. The daemon delivers 1 and 2, and refuses and counts the others. `reason` is
-/// what its log says of one.
+/// A peer publishes samples of these numbers. The daemon delivers 1 and 2, and refuses and counts the others. `reason`
+/// is its log text for a refused sample.
 fn numbers_are_refused(numbers: &[u64], reason: &str) -> (Camera, Met) {
     let camera = Camera::new();
     let subscription = subscription(&camera);
@@ -145,7 +145,7 @@ fn a_number_that_its_publisher_cannot_have_reached_counts_as_no_losses() {
 fn a_number_that_cannot_be_is_refused_counted_by_topic_and_loses_nothing_else() {
     let numbers = [u64::MAX, 1, u64::MAX - 1, 1 << 50, 2];
     let (camera, _link) = numbers_are_refused(&numbers, "its number is");
-    // As what is dropped for any cause: once a second, however many there are.
+    // The log line is the same as for samples that are dropped for any cause: at most one a second.
     camera.a.wait_log(&["WARN", "samples are dropped", TOPIC, "ring"]);
     assert_eq!(camera.a.status().links.iter().filter(|link| link.host == "camera").count(), 1);
 }

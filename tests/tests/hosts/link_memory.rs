@@ -1,4 +1,5 @@
-//! What the memory of a daemon holds of a connection whose secrets are known: while it stands, and nothing after its end.
+//! Searches the memory of a daemon for a connection whose secrets are known: while the connection stands, and after its
+//! end, when nothing may be left.
 
 use std::{
     thread,

@@ -51,7 +51,7 @@ fn a_flood_that_overtakes_its_reader_arrives_in_order_with_its_end() {
         assert_eq!(publisher.publish(&bytes).unwrap(), number);
     }
     let (taken, lost) = reader.join().unwrap();
-    // What it passes over for the depth, or before the first that it takes, is none of its losses.
+    // Samples that the depth skips, and samples before the first taken one, are not losses of the subscription.
     assert!(taken + lost <= SAMPLES, "{taken} taken, {lost} lost");
 }
 
@@ -82,17 +82,17 @@ fn an_unread_topic_blocks_only_its_own_publisher() {
         }
     }
     reader.join().unwrap();
-    // What was held up is all there.
+    // All delayed samples arrive.
     let mut bytes = Vec::new();
     for number in 1..=sent {
         assert_eq!((take(&unread, &mut bytes), bytes.len()), (number, large.len()));
     }
 }
 
-/// So many of a flood towards a daemon that stands still get there when it goes on.
+/// Returns how many samples of a flood towards a stopped daemon arrive when the daemon goes on.
 fn survivors(queue_mb: &str) -> usize {
     const SAMPLES: u64 = 300;
-    // What the queue does not take waits in the ring.
+    // Samples that do not fit the queue wait in the ring.
     let ring = ("AXON_RING_BUFFER_SIZE_MB", "8");
     let settings = classic(&[("AXON_RELIABLE_QUEUE_MB", queue_mb), ring]);
     let hosts = Plan::new([settings, classic(&[])]).start();

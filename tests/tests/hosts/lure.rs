@@ -1,4 +1,4 @@
-//! A daemon that dials somebody who is none: what it takes for a peer's beacons lead it there.
+//! A daemon that dials an address without a peer, to which forged beacons lead it.
 
 use std::{
     net::{Ipv4Addr, SocketAddr, UdpSocket},
@@ -26,7 +26,7 @@ const EVERY: Duration = Duration::from_millis(200);
 struct Lure(Arc<AtomicBool>);
 
 impl Lure {
-    /// Beacons that say that a daemon with these terms is at `at`, which the daemon of `host` lists.
+    /// Sends beacons that a daemon with these terms is at `at`, which the daemon of `host` lists.
     fn new(host: &Host, at: SocketAddr, terms: SecurityTerms, sae: Option<&str>) -> Self {
         let beacon = Datagram::Beacon(Beacon {
             protocols: (1, 1),
@@ -46,7 +46,7 @@ impl Lure {
         let over = Arc::<AtomicBool>::default();
         let until = Arc::clone(&over);
         thread::spawn(move || {
-            // Relaxed: nothing else is told by it.
+            // Relaxed: the flag orders nothing else.
             while !until.load(Ordering::Relaxed) {
                 // An error: the daemon has ended.
                 let _ = socket.send_to(&beacon.encode(), to);
@@ -63,13 +63,13 @@ impl Drop for Lure {
     }
 }
 
-/// A server on this host's loopback address, which accepts nobody yet.
+/// Creates a server on this host's loopback address, which accepts no connection yet.
 pub(crate) fn server(config: ServerConfig, address: Ipv4Addr) -> Endpoint {
     Endpoint::server(config, (address, 0).into()).unwrap()
 }
 
 /// Accepts the one connection that the daemon of `host` dials to `at`, and then no other. `at` leads to `server`. The
-/// daemon needs a session: one without looks for nobody.
+/// daemon needs a session: without one it looks for no peer.
 pub(crate) async fn accept_dial(
     server: &Endpoint,
     host: &Host,
@@ -81,7 +81,7 @@ pub(crate) async fn accept_dial(
     let accepted = async { server.accept().await.unwrap().await.unwrap() };
     let connection = tokio::time::timeout(PATIENCE, accepted).await.expect("the daemon dials");
     drop(lure);
-    // Or a second dial, which may be under way, would go on as long as nobody answers it.
+    // Otherwise a second dial, which may be under way, would go on until it is answered.
     let server = server.clone();
     tokio::spawn(async move {
         while let Some(another) = server.accept().await {

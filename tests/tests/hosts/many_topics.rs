@@ -22,7 +22,7 @@ use super::{
     stranger::{Claim, Stranger, high_id},
 };
 
-/// More than may cross where the graph of a peer is bounded to 1 MiB.
+/// Number of topics: more than may cross if the graph of a peer is bounded to 1 MiB.
 const CROWD: u32 = 2_000;
 const TYPE: &str = "test/Bytes";
 
@@ -43,7 +43,7 @@ fn subscribe(route: u32) -> LinkMessage {
     })
 }
 
-/// How many topics the host shows as refused.
+/// Returns how many topics the host shows as refused.
 fn refused(host: &Host) -> usize {
     let links = host.status().links;
     links.iter().map(|link| link.routes_refused.len() + link.more_routes_refused).sum()
@@ -79,7 +79,7 @@ fn excess_routes_of_a_peer_are_refused_by_name_and_its_link_stays() {
     let shown = host.status().links.into_iter().find(|link| link.host == "greedy").unwrap();
     let name = format!("/crowd_{:05}", first.route);
     assert!(shown.routes_refused.keys().any(|topic| topic.contains(&name)), "{shown:?}");
-    // Where there is room it gets it.
+    // When there is room again, the route is served.
     stranger.say(&mut met, &LinkMessage::Unsubscribe(Unsubscribe { route: 0 }));
     stranger.say(&mut met, &subscribe(first.route));
     let ready =
@@ -89,10 +89,10 @@ fn excess_routes_of_a_peer_are_refused_by_name_and_its_link_stays() {
     until("it is shown no more", || refused(&host) == more - 1);
 }
 
-/// Threads that create endpoints. Each endpoint waits a while for those on the other host that it is matched with.
+/// Number of threads that create endpoints. Each endpoint waits a while for its matches on the other host.
 const CREATORS: u32 = 64;
 
-/// One end of each of so many topics.
+/// Creates one end of each of `count` topics.
 fn ends<T: Send>(
     session: &Session,
     count: u32,
@@ -147,7 +147,8 @@ impl Crowd {
 fn excess_topics_are_named_on_the_subscribing_host_and_disturb_no_others() {
     let hosts = small_hosts();
     let mut crowd = Crowd::new(&hosts, CROWD);
-    // What does not cross is refused, by its name on one of the hosts: as a route, or as an endpoint of a graph.
+    // A topic that does not cross is refused, by its name, on one of the hosts: as a route, or as an endpoint of a
+    // graph.
     until("as many cross as may", || {
         let links = hosts.iter().map(Host::link);
         let left_out = links.map(|link| link.endpoints_left_out).sum::<u64>() as usize;
@@ -164,7 +165,7 @@ fn excess_topics_are_named_on_the_subscribing_host_and_disturb_no_others() {
     drop(crowd.publishers.remove(first));
     drop(crowd.subscriptions.remove(first));
     until("another crosses", || crowd.crossing() == crossing);
-    // That both dialled, and one of the two connections was closed, ends no link.
+    // Both hosts dialled, and one of the two connections was closed. That ends no link.
     for host in &hosts {
         host.link();
         assert_eq!(host.log_lines(&["link down"]), 0, "the link stood");
@@ -205,7 +206,7 @@ fn a_refused_route_is_shown_at_the_subscription_and_at_the_publisher_that_wait()
         (crowd.publishers[refused[0]].gid(), crowd.subscriptions[refused[0]].gid());
     let [here, there] = [waits(&hosts[0], publisher), waits(&hosts[1], subscription)];
     assert!(here.iter().chain(&there).all(|why| why.contains(": ")), "{here:?} {there:?}");
-    // Once there is room for all it is shown no more.
+    // Once there is room for all endpoints, no refusal is shown any more.
     let keep = refused[0];
     let keep = [crowd.publishers.swap_remove(keep)]
         .into_iter()
@@ -263,7 +264,7 @@ fn twenty_thousand_topics_cross_between_two_hosts() {
     let hosts = Plan::new([classic(&[]), classic(&[])]).start();
     let crowd = Crowd::new(&hosts, MANY);
     let mut before = 0;
-    // As long as it gets on: a machine may be slow.
+    // The test waits as long as there is progress, because a machine may be slow.
     while before < MANY as usize {
         until("more topics cross", || crowd.crossing() > before);
         before = crowd.crossing();
@@ -287,7 +288,7 @@ fn processor(host: &Host) -> Duration {
     Duration::from_nanos(used.sum())
 }
 
-/// Messages of 64 bytes, one at a time, over 1 to 10,000 topics: what each costs the daemons.
+/// Measures the cost of a message for the daemons: messages of 64 bytes, one at a time, over 1 to 10,000 topics.
 #[test]
 #[ignore = "prints what it measures"]
 #[allow(clippy::print_stdout, reason = "it prints what it measures")]

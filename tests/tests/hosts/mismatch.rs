@@ -1,4 +1,4 @@
-//! Hosts whose settings differ do not link, and both say which.
+//! Tests that hosts whose settings differ do not link, and that both report the setting.
 
 use std::{thread, time::Duration};
 

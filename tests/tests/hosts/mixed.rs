@@ -47,7 +47,7 @@ fn take_all(subscription: &Subscription, from: u64, last: u64) {
     let mut bytes = Vec::new();
     let mut taken = take(subscription, &mut bytes);
     while taken < from {
-        // Was under way when it came.
+        // The sample was in flight when the subscription came.
         taken = take(subscription, &mut bytes);
     }
     assert_eq!(taken, from, "the first");
@@ -82,7 +82,7 @@ fn join(publisher: &Publisher, there: &Session, topic: &str, qos: Qos) -> Subscr
 
 #[test]
 fn a_reliable_subscription_gets_all_that_a_best_effort_one_before_it_may_miss() {
-    // As many at once as any ring keeps for a reader that is late.
+    // Maximum number of samples at once that every ring keeps for a late reader.
     const BURST: u64 = 8;
     let hosts = hosts();
     let topic = "/lossy_first";
@@ -106,7 +106,7 @@ fn keep_all_reader_holds_a_publisher_back_beside_an_earlier_keep_last_reader() {
     let next = join(&publisher, &there, topic, Qos::keep_all());
     let from = publish(&publisher, b"first");
     let large = vec![0x5a; 1 << 20];
-    // More than all rings, windows and queues on the way hold.
+    // There are more samples than all rings, windows and queues on the way hold.
     let numbers = (0..500).map_while(|_| publisher.publish(&large).ok());
     let last = numbers.last().expect("some of them have room");
     take_all(&next, from, last);
@@ -125,7 +125,7 @@ fn a_subscription_loses_no_samples_when_another_requests_more_depth() {
     thread::scope(|scope| {
         let publishing = scope.spawn(|| {
             let mut sent = 0;
-            // The other thread's `over` is a hint, and what it took is told by `join`.
+            // Relaxed: `over` is a hint, and `join` passes on the other thread's result.
             while !over.load(Ordering::Relaxed) {
                 publish(&publisher, &[0x5a; 4000]);
                 assert!(publisher.matched().contains(&gid), "it is there all the time");
@@ -190,7 +190,7 @@ fn servers_that_come_take_no_request_from_one_that_is_there() {
             number
         });
         for _ in 0..SERVERS {
-            // Of a session of its own, whose GIDs may be below those of the first.
+            // The server belongs to a session of its own, whose GIDs may be below those of the first.
             let session = hosts[1].session("another");
             let other = session.create_server(service()).unwrap();
             until("it is reached", || client.servers().contains(&other.gid()));

@@ -19,7 +19,7 @@ pub(crate) type Drawn = Vec<(String, Vec<u8>)>;
 
 pub(crate) const SAE: [&str; 2] = ["sae-a", "sae-b"];
 
-/// KMEs of the two hosts, and what they gave the SAEs.
+/// The KMEs of the two hosts, and the keys that they gave the SAEs.
 pub(crate) struct Kmes {
     network: sim::Network,
     dir: tempfile::TempDir,
@@ -78,22 +78,22 @@ impl Kmes {
         self.tls.lock().unwrap().clone()
     }
 
-    /// Has the KME of host 0 or 1 do something wrong.
+    /// Makes the KME of host 0 or 1 fail as `plan` says.
     pub(crate) fn plan(&self, host: usize, plan: sim::FaultPlan) {
         self.network.kmes()[host].plan(plan);
     }
 
-    /// Has all KMEs do everything right again.
+    /// Ends the failures of all KMEs.
     pub(crate) fn clear_faults(&self) {
         self.network.kmes().iter().for_each(sim::Kme::clear_faults);
     }
 
-    /// Notes what the KMEs hold, as a backup does.
+    /// Stores the state of the KMEs, as a backup does.
     pub(crate) fn note_state(&self) {
         self.network.note_state();
     }
 
-    /// Sets the KMEs back to what was noted: they give the keys since then again.
+    /// Restores the stored state of the KMEs: they give the keys since then again.
     pub(crate) fn set_back(&self) {
         self.network.set_back();
     }
@@ -142,7 +142,7 @@ pub(crate) fn classic(more: &[(&'static str, &str)]) -> Settings {
     settings
 }
 
-/// Two hosts with keys of their own, of which each trusts those in its row: `trusts[0][1]` says
+/// Returns the settings of two hosts with keys of their own. Each trusts the hosts in its row: `trusts[0][1]` says
 /// whether host 0 trusts host 1.
 pub(crate) fn pinned(dir: &Path, trusts: [[bool; 2]; 2]) -> [Settings; 2] {
     let pems = [0, 1].map(|_| SigningKey::generate_pem().unwrap());

@@ -1,4 +1,4 @@
-//! KMEs that fail for a while, and what log and status say of it.
+//! Tests KMEs that fail for a while: what the log and the status report.
 
 use std::{
     net::{SocketAddr, TcpStream},
@@ -24,7 +24,7 @@ fn hosts(kmes: &Kmes, key_mode: &str) -> [Host; 2] {
     Plan::new([0, 1].map(|host| kmes.settings(host, &more))).start()
 }
 
-/// Both hosts link, and neither has anything to say of it.
+/// Checks that both hosts link, and that neither logs a refusal.
 fn starts_without_a_refusal(key_mode: &str) {
     let kmes = Kmes::start();
     let hosts = hosts(&kmes, key_mode);
@@ -185,8 +185,8 @@ fn a_kme_that_hangs_for_five_seconds_loses_nothing_where_keys_come_by_name() {
     hangs_as_a_whole(1, Method::DecKeys, "dec_keys");
 }
 
-/// A socket that lets nobody connect, as a host does behind a firewall: what fills its queue stands, and of others the
-/// first packet is dropped.
+/// A socket to which no connection succeeds, as behind a firewall: some connections fill its queue, and the kernel
+/// drops the first packet of others.
 struct Deaf {
     address: SocketAddr,
     _socket: OwnedFd,
@@ -248,7 +248,7 @@ fn a_kme_that_accepts_no_connection_is_given_up_at_the_limit_for_connecting() {
     let kmes = Kmes::start();
     let deaf = Deaf::new();
     let url = format!("https://{}", deaf.address);
-    // One that waited for an answer would say so, and name that setting.
+    // A client that waited for an answer would log that, and name that setting.
     let limits = [("AXON_KME_CONNECT_TIMEOUT", "1"), ("AXON_KME_ANSWER_TIMEOUT", "10")];
     let of_deaf = [limits[0], limits[1], ("AXON_KME_URL", url.as_str())];
     let hosts = Plan::new([kmes.settings(0, &of_deaf), kmes.settings(1, &limits)]).start();

@@ -33,10 +33,10 @@ use super::{
 /// The topic of all these tests.
 pub(crate) const TOPIC: &str = "/numbers";
 
-/// What two hosts are started with.
+/// The plan for the start of two hosts.
 #[derive(Clone, Debug)]
 pub(crate) struct Plan {
-    /// Of host A and host B.
+    /// The settings of host A and host B.
     pub(crate) settings: [Settings; 2],
     /// Seconds that a daemon outlives its last session.
     pub(crate) grace_s: u32,
@@ -46,11 +46,11 @@ pub(crate) struct Plan {
     pub(crate) graph_mb: Option<u32>,
     /// Whether host B is in another domain.
     pub(crate) other_domain: bool,
-    /// Whether only what lies between them leads from one to the other: [`Host::wire`].
+    /// Whether only a simulated wire connects the hosts: [`Host::wire`].
     pub(crate) wired: bool,
-    /// How many wires lead from one to the other, where they are `wired`.
+    /// The number of wires between the hosts, if they are `wired`.
     pub(crate) paths: usize,
-    /// Whether they list each other; if not, multicast on the loopback has to do.
+    /// Whether the hosts list each other; if not, they find each other by multicast on the loopback.
     pub(crate) listed: bool,
 }
 
@@ -122,7 +122,7 @@ pub(crate) struct Host {
     pub(crate) dir: tempfile::TempDir,
     env: Vec<(String, String)>,
     pub(crate) daemon: Option<Kept>,
-    /// Until no process of the host runs any more.
+    /// The lease lasts until no process of the host runs any more.
     _lease: Arc<DomainLease>,
 }
 
@@ -185,7 +185,8 @@ impl Host {
         self.start_as(command);
     }
 
-    /// The same, after a command of the shell, and without the right to go beyond the limits that it sets.
+    /// Starts the daemon after a command of the shell, and without the right to exceed the limits that the command
+    /// sets.
     pub(crate) fn start_by(&mut self, shell: &str) {
         let script = format!("{shell} && exec \"$0\" --while-stdin");
         let mut command = match rustix::process::geteuid().is_root() {
@@ -289,7 +290,7 @@ impl Host {
         Some(serde_json::from_str(&json).unwrap())
     }
 
-    /// What its daemon says, once there is one.
+    /// Returns the daemon's status, once there is a daemon.
     #[track_caller]
     pub(crate) fn status(&self) -> Status {
         let mut status = None;
@@ -341,19 +342,19 @@ impl Host {
         log.lines().filter(|line| parts.iter().all(|part| line.contains(part))).count()
     }
 
-    /// Whether its daemon is the process that it was started with.
+    /// Returns whether the host's daemon is the process with which it was started.
     pub(crate) fn is_first_daemon(&self) -> bool {
         self.daemon.as_ref().is_some_and(|daemon| daemon.0.id() == self.status().pid)
     }
 
-    /// A publisher that waits for as many readers; a stream without a count.
+    /// Starts a publisher that waits for `readers` readers; without a count it publishes a stream.
     pub(crate) fn publish(&self, sizes: Sizes, readers: usize, count: Option<u64>) -> Node {
         let count = count.map_or_else(|| "stream".to_owned(), |count| count.to_string());
         let readers = readers.to_string();
         self.node(&["publish", TOPIC, sizes.name(), &readers, &count])
     }
 
-    /// A publisher that waits for as many readers and then streams as fast as they let it.
+    /// Starts a publisher that waits for `readers` readers and then publishes as fast as they permit.
     pub(crate) fn flood(&self, sizes: Sizes, readers: usize) -> Node {
         self.node(&["publish", TOPIC, sizes.name(), &readers.to_string(), "flood"])
     }
@@ -370,7 +371,7 @@ impl Host {
         Session::open(&self.config(), SessionOptions::new(name)).unwrap()
     }
 
-    /// The same, which shares no memory with the daemon.
+    /// Opens the same session without memory that it shares with the daemon.
     pub(crate) fn relayed_session(&self, name: &str) -> Session {
         let mut config = self.config();
         config.shm = false;
@@ -410,7 +411,7 @@ impl Drop for Host {
                 let text = format!("{links:#?}\n{refusals:#?}\n{keys}");
                 eprintln!("{}", excerpt(&format!("the status of host {}", self.name), &text));
             }
-            // One that a session started is nobody's child.
+            // A daemon that a session started is not a child of this process.
             kill(status.pid);
         }
         if std::thread::panicking() {

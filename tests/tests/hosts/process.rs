@@ -42,7 +42,7 @@ pub(crate) struct Node {
     said: Arc<Mutex<Said>>,
 }
 
-/// What it said so far.
+/// The output of the process so far.
 #[derive(Clone, Debug, Default)]
 struct Said {
     ready: bool,
@@ -87,12 +87,12 @@ impl Node {
         until("a node is ready", || self.said().ready);
     }
 
-    /// What a publisher published by now, at least.
+    /// Returns the number of samples that a publisher has published, or fewer.
     pub(crate) fn published(&mut self) -> u64 {
         self.said().published
     }
 
-    /// What a subscription took by now, at least.
+    /// Returns the tally of a subscription, which may be a little old.
     pub(crate) fn tally(&mut self) -> Tally {
         self.said().tally
     }
@@ -104,7 +104,7 @@ impl Node {
         self.said().sent.unwrap()
     }
 
-    /// Ends a stream; so many samples it had.
+    /// Ends a stream, and returns the number of its samples.
     #[track_caller]
     pub(crate) fn stop(&mut self) -> u64 {
         self.stdin.as_ref().unwrap().write_all(b"\n").unwrap();

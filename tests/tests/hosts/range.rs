@@ -25,7 +25,7 @@ use DiscoveryRange::{Localhost, Off, Subnet};
 /// Samples of each publisher, none of which may cross that must not.
 const SAMPLES: u64 = 400;
 
-/// This process's environment is not the host's: a daemon that it started would be another one.
+/// The environment of this process is not the host's: a daemon that this process started would be another one.
 const REQUIRE: DaemonPolicy = DaemonPolicy::Require;
 
 fn spec() -> EndpointSpec {
@@ -37,7 +37,7 @@ fn open(host: &Host, range: DiscoveryRange, lists: &[&Host]) -> Session {
     Session::open(&ranged(host, range, lists), SessionOptions::new(range.name())).unwrap()
 }
 
-/// As [`open`], sharing no memory with its daemon.
+/// Opens a session like [`open`], but without memory that it shares with its daemon.
 fn open_relayed(host: &Host, range: DiscoveryRange, lists: &[&Host]) -> Session {
     let mut config = ranged(host, range, lists);
     config.shm = false;
@@ -87,7 +87,7 @@ fn take_of(subscription: &Subscription, writer: Gid) {
     }
 }
 
-/// Whether nothing is there to be taken.
+/// Returns whether no sample waits.
 fn is_empty(subscription: &Subscription) -> bool {
     !subscription.has_data()
 }
@@ -114,15 +114,15 @@ fn session_of(host: &Host, name: &str) -> SessionStatus {
     sessions.into_iter().find(|session| session.name == name).expect("the session is listed")
 }
 
-/// Hosts without daemons, and with daemons that have no range of their own where `daemons` says so.
+/// Prepares two hosts. With `daemons` they have daemons without a range of their own.
 fn hosts(daemons: bool) -> [Host; 2] {
     let silent = || classic(&[("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")]);
     let plan = Plan::new(if daemons { [silent(), silent()] } else { [classic(&[]), classic(&[])] });
     if daemons { plan.start() } else { plan.prepare() }
 }
 
-/// A LOCALHOST session beside a SUBNET one: what the first publishes stays here, and what the second
-/// publishes arrives, whichever of them started the daemon.
+/// Tests a LOCALHOST session beside a SUBNET one. Samples of the first stay on the host, and samples of the second
+/// arrive at the other host. Either session may have started the daemon.
 fn localhost_beside_subnet(first: &[(&str, &str)]) {
     let [a, b] = hosts(false);
     // It starts the daemon of A, and one of B's own range starts that of B.
@@ -144,7 +144,7 @@ fn localhost_beside_subnet(first: &[(&str, &str)]) {
     take_all_of(&away, sent.gid());
     assert!(is_empty(&away), "not one of the LOCALHOST session's");
 
-    // The other way round: what is published there does not reach the LOCALHOST session.
+    // In the other direction, samples that are published there do not reach the LOCALHOST session.
     let (far, from_there) = (subscription(&near), publisher(&there));
     meet(&from_there, &here);
     meet(&sent, &far);
@@ -226,7 +226,7 @@ fn a_localhost_session_meets_the_hosts_that_it_lists() {
     publish(&from_there);
     take_of(&here, from_there.gid());
     apart(&unlisting, &kept, &there, &away);
-    // Its own session's, and not one of the session that lists nobody.
+    // These samples are of the session that lists B, and not of the session that lists no host.
     take_all_of(&away, from_there.gid());
     assert!(is_empty(&away));
     let shown = session_of(&a, "LOCALHOST");
@@ -256,7 +256,7 @@ fn discovery_looks_as_far_as_the_sessions_that_there_are() {
         until("nobody looks that far", || a.status().discovery.range == "LOCALHOST");
         apart(&near, &kept, &there, &away);
     }
-    // A session there lists this host: then it is in range while that one is there.
+    // A session on B lists this host, so this host is in its range while that session exists.
     let listing = open(&b, Subnet, &[&a]);
     let listens = subscription(&listing);
     meet(&kept, &listens);

@@ -54,11 +54,12 @@ fn nothing_lost(sent: u64, tally: &Tally) {
     assert_eq!(*tally, Tally { taken: sent, first: 1, last: sent, ..Tally::default() });
 }
 
-/// A link whose key is at its end and that has no successor is cut, and what it carried is gone unknown. A
-/// flood takes so much of a processor that this may come about within a second.
+/// Maximum age of keys, in seconds, in tests with floods. A link whose key expires and that has no successor is cut, and
+/// its samples are lost without a count. A flood takes so much of a processor that this may happen within a second.
 const OF_FLOODS: &str = "3";
 
-/// What a link still has to carry when it is superseded has no longer than its key, which a flood may exceed.
+/// Checks that samples arrived in order and that missing ones are counted. A superseded link can carry its remaining
+/// samples only until its key expires, and a flood may have more.
 #[track_caller]
 fn in_order_and_counted(sent: u64, tally: &Tally) {
     assert_eq!((tally.repeated, tally.corrupt, tally.first), (0, 0, 1), "{tally:?}");
@@ -91,7 +92,7 @@ fn in_messages10_nothing_is_lost() {
     nothing_lost(sent, &tally);
 }
 
-/// Its keys and its connection change in the middle of what is written together.
+/// The keys and the connection change in the middle of data that is written together.
 #[test]
 fn in_messages10_a_flood_stays_in_order() {
     let (sent, tally) = renew("messages10", OF_FLOODS, flood);
@@ -111,7 +112,7 @@ fn fill(publisher: &Publisher) -> u64 {
     sent
 }
 
-/// Hosts that keep little, with keys of so many seconds.
+/// Starts hosts that keep little, with keys of `max_age` seconds.
 fn little_room(key_mode: &str, max_age: &str) -> (Kmes, [Host; 2]) {
     let kmes = Kmes::start();
     let more = [
@@ -143,13 +144,13 @@ fn what_waits_is_not_lost(key_mode: &str) {
         let info = subscription.recv(&mut bytes, Some(PATIENCE)).expect("what was sent");
         assert_eq!((info.sequence, bytes.len()), (number, 50_000), "of {sent}");
     }
-    // And the successor carries what comes.
+    // The successor carries the next sample.
     let next = publisher.publish(b"next").unwrap();
     assert_eq!(subscription.recv(&mut bytes, Some(PATIENCE)).unwrap().sequence, next);
     assert_eq!(subscription.lost(), 0);
 }
 
-/// What a link still carries when its key is at its end is counted, and nobody is blamed for it.
+/// Samples that a link still carries when its key expires are counted, and no peer is blamed for them.
 #[test]
 fn in_messages10_samples_older_than_their_key_cause_no_envelope_refusal() {
     let (_kmes, [a, b]) = little_room("messages10", "4");

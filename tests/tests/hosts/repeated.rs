@@ -41,7 +41,7 @@ fn keys_that_both_hosts_had_before_their_restart_are_refused_by_name() {
 
     kmes.set_back();
     hosts.iter_mut().for_each(Host::start);
-    // Who dials first is the master of the first key.
+    // The host that dials first is the master of the first key.
     let named = |host: &Host| {
         let failure = host.status().keys["kme"]["last_failure"].as_str().map(str::to_owned);
         failure.is_some_and(|text| text.contains("again, which this host had before"))

@@ -16,12 +16,12 @@ use super::{
 const SOME: u64 = 200;
 
 impl Host {
-    /// Whether nobody is at home.
+    /// Returns whether no daemon runs.
     pub(crate) fn has_no_daemon(&self) -> bool {
         self.try_status().is_none()
     }
 
-    /// Kills its daemon without a warning, and says which it was.
+    /// Kills the host's daemon without a warning, and returns its last status.
     pub(crate) fn kill_daemon(&mut self) -> Status {
         let status = self.status();
         pair::kill(status.pid);
@@ -74,14 +74,14 @@ fn kill_while(
     let remote = there.tally();
     assert_eq!((remote.repeated, remote.corrupt, remote.first), (0, 0, 1), "{remote:?}");
     assert_eq!(remote.taken + remote.missing, sent, "{remote:?}");
-    // What was under way when the link broke is known to be lost.
+    // The samples that were in flight when the link broke count as lost.
     until("the losses are reported", || there.tally().lost == remote.missing);
     for node in [publisher, here, there] {
         node.finish();
     }
 
-    // Nobody needs them any more. The one that a session started ends by itself, the other is told to, and
-    // neither leaves anything behind to trip over.
+    // No session needs the daemons any more. The one that a session started ends by itself; the other gets a signal.
+    // Neither leaves anything behind that disturbs its successor.
     pair::signal(hosts[1 - victim].status().pid, Signal::TERM);
     for host in &hosts {
         until("the daemon ends", || host.has_no_daemon());
@@ -111,7 +111,7 @@ fn of_the_subscriber_in_classic() {
     kill([classic(&[]), classic(&[])], 1, None);
 }
 
-/// The link is cut in the middle of what is written together.
+/// The link is cut in the middle of data that is written together.
 #[test]
 fn in_the_middle_of_a_flood() {
     let flood = |host: &Host| host.flood(Sizes::Small, 2);

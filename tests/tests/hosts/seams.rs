@@ -1,4 +1,4 @@
-//! Nothing is lost at a seam: cut links, publishers that end, killed daemons.
+//! Tests that nothing is lost at a seam: cut links, publishers that end, killed daemons.
 
 use std::{thread, time::Duration};
 
@@ -25,7 +25,7 @@ fn across(hosts: &[Host; 2], qos: Qos) -> (Publisher, Subscription) {
     across_with(hosts, qos, [true, true])
 }
 
-/// The same; each says whether it shares memory with its daemon.
+/// Does the same. `shm` says for each session whether it shares memory with its daemon.
 fn across_with(hosts: &[Host; 2], qos: Qos, shm: [bool; 2]) -> (Publisher, Subscription) {
     let session = |host: usize, name| match shm[host] {
         true => hosts[host].session(name),
@@ -48,7 +48,7 @@ fn publish(publisher: &Publisher, samples: u64, length: usize, every: Duration) 
     }
 }
 
-/// What the status of a host counts as lost, by cause.
+/// Returns the losses in the status of a host, by cause.
 fn lost(host: &Host) -> Vec<(String, u64)> {
     let topics = host.status().topics;
     let topics = topics.into_iter().filter(|topic| topic.topic == TOPIC);
@@ -134,7 +134,8 @@ fn samples_of_a_process_killed_during_a_cut_arrive() {
     assert_eq!((tally.taken, tally.lost), (100, 0), "{tally:?}");
 }
 
-/// Publishes while daemons are killed and started again; each end says whether it shares memory with its daemon.
+/// Publishes while daemons are killed and started again; `shm` says for each end whether it shares memory with its
+/// daemon.
 fn outlasts(killed: &[usize], shm: [bool; 2]) {
     const SAMPLES: u64 = 500;
     let mut hosts = Plan::new([classic(&[]), classic(&[])]).start();

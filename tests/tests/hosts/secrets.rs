@@ -1,11 +1,12 @@
-//! What hundreds of keys leave behind in the memory of the daemons that used them.
+//! Tests what hundreds of keys leave in the memory of the daemons that used them.
 //!
-//! Searched for: each KME key, raw, as base64, and in the forms in which SHA-256 and HMAC handle it;
-//! what HKDF extracts from it for the PSK, the READY proof and the envelope; the PSK, the secrets of TLS
-//! that depend on nothing else, and the key of the READY proof. Of each connection in `psk_ke`, whose handshake is
-//! [`recorded`](super::recorded): all secrets of TLS, the keys of QUIC's packets and headers, what the daemon exports,
-//! and the AEAD key of each KME key in both directions, with its key of GHASH and the masks of its tags, whose nonces are
-//! read from the recorded packets. The module `dhe` searches for those of a connection in `psk_dhe_ke`.
+//! The tests search for each KME key, raw, as base64, and in the forms in which SHA-256 and HMAC handle it. They search
+//! for the keys that HKDF extracts from it for the PSK, the READY proof and the envelope, for the PSK, for the secrets
+//! of TLS that depend on nothing else, and for the key of the READY proof. For each connection in `psk_ke`, whose
+//! handshake is [`recorded`](super::recorded), they search for all secrets of TLS, the keys of QUIC's packets and
+//! headers, and the daemon's exported secrets. They also search for the AEAD key of each KME key in both directions,
+//! with its key of GHASH and the masks of its tags, whose nonces are read from the recorded packets. The module `dhe`
+//! searches for the secrets of a connection in `psk_dhe_ke`.
 
 use std::{
     cell::RefCell,
@@ -31,7 +32,7 @@ use super::{
     wire::Wire,
 };
 
-/// How long messages flow between two searches.
+/// Duration of the message flow between two searches.
 const FLOW: Duration = Duration::from_millis(500);
 
 fn length_prefixed(names: &[&[u8]]) -> Vec<u8> {
@@ -48,14 +49,14 @@ struct Hosts {
     hosts: [Host; 2],
     wire: Wire,
     kmes: Kmes,
-    /// Whether the recorded handshakes tell the secrets of connections.
+    /// Whether the recorded handshakes reveal the secrets of connections.
     recorded: bool,
-    /// Those of the envelopes, which the recorded packets tell; whether there are any.
+    /// The nonces of the envelopes in the recorded packets, and whether there are any.
     nonces: RefCell<Nonces>,
     reads_nonces: bool,
 }
 
-/// What is searched for.
+/// The objects of a search.
 struct Sought {
     needles: Needles,
     /// Keys that were drawn so far.
@@ -64,15 +65,16 @@ struct Sought {
     with_nonces: usize,
     /// Connections that were established so far, and that were recorded.
     connections: usize,
-    /// The keys of these.
+    /// The numbers of the spent keys.
     spent: BTreeSet<usize>,
 }
 
-/// What was found and may be there, or not.
+/// The findings, permitted or not.
 #[derive(Default)]
 struct Found {
     wrong: usize,
-    /// Those among them that are text of the KME's answers, and of how many keys one daemon has such text at most.
+    /// Permitted findings that are text of the KME's answers, and the maximum number of keys of which one daemon has
+    /// such text.
     texts: usize,
     keys_in_text: usize,
     on_stacks: usize,
@@ -80,20 +82,20 @@ struct Found {
     held: BTreeSet<usize>,
     /// Connections of which there are secrets.
     connections: BTreeSet<usize>,
-    /// Processes that have the cipher of envelopes, and those that have secrets of connections.
+    /// Number of processes that have the cipher of envelopes, and number of those that have secrets of connections.
     with_ciphers: usize,
     with_connections: usize,
-    /// What is of connections, or of the ciphers of their envelopes.
+    /// Findings of connections, or of the ciphers of their envelopes.
     of_connections: Vec<Find>,
 }
 
 const AEAD: &str = "AEAD key";
 const GHASH: &str = "GHASH key";
-/// Nobody ever needs it but for the moment in which an envelope is sealed or opened.
+/// A mask is needed only while an envelope is sealed or opened.
 const MASK: &str = "tag mask";
 const TEXT: &str = "KME key, base64";
-/// So many keys have their text in one daemon while messages flow, however many were drawn: those of the last answers of
-/// each connection to the KME, which has up to eight.
+/// Maximum number of keys whose text one daemon has while messages flow: the keys of the last answers of each
+/// connection to the KME. A daemon has up to eight connections.
 const KEYS_IN_TEXT: usize = 32;
 
 /// Keys that wait for their use are in locked memory alone. Ciphers and the secrets of a connection are in use.
@@ -158,7 +160,7 @@ impl Hosts {
         Sought { needles, drawn: drawn.len(), with_nonces, connections: connections.len(), spent }
     }
 
-    /// Searches the daemons of these hosts, and these applications, which have nothing.
+    /// Searches the daemons of these hosts, and these applications, in which there must be no finding.
     fn search(&self, hosts: &[Host], applications: &[&Node]) -> (Sought, Found) {
         let pids: Vec<u32> = hosts.iter().map(|host| host.status().pid).collect();
         // All, or the one that runs on would find the other silent.
@@ -202,9 +204,9 @@ impl Hosts {
         (sought, all)
     }
 
-    /// Searches while messages flow, until what is found is in use. A process that is stopped in the middle of a
-    /// derivation has its input on the stack, and text of the KME's answers goes while there are new ones only for the
-    /// next: neither is there each time, or for long.
+    /// Searches while messages flow, until only secrets in use are found. A process that is stopped in the middle of a
+    /// derivation has its input on the stack. Text of the KME's answers disappears only when new answers come. Neither
+    /// occurs in each search, or lasts for long.
     fn wait_clean(&self, applications: [&Node; 2]) {
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -231,8 +233,8 @@ impl Hosts {
         }
     }
 
-    /// Searches until nothing is left of `spent()` keys but what locked memory holds of the others, and of no connection
-    /// but the one that stands.
+    /// Searches until nothing is left of the `spent()` spent keys and of ended connections. Locked memory may hold the
+    /// other keys, and secrets of the current connection may remain.
     fn wait_erased(&self, applications: [&Node; 2], spent: impl Fn() -> u64) {
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -244,7 +246,7 @@ impl Hosts {
                 "{drawn} keys were drawn, {spent} are spent, {held} are held; {connections} connections were \
                  recorded, {stand} are held; of {with_nonces} keys nonces were read"
             );
-            // Nothing ever erases a stack but the work that used it, at once.
+            // Only the work that used a stack erases it, at once.
             assert_eq!(found.on_stacks, 0, "parts of secrets are left on stacks");
             // An answer of the KME stays in its connection's buffers until that is closed as idle.
             // Or the masks of their tags were not searched for.

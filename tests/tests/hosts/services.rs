@@ -24,7 +24,7 @@ const CLIENTS: u64 = 20;
 const CALLS: u64 = 20;
 const SERVICE: &str = "/echo";
 
-/// Nothing that nobody took yet is passed over.
+/// Returns the specification of a KEEP_ALL service, which passes over no message that was not taken.
 fn spec() -> EndpointSpec {
     EndpointSpec::new(SERVICE, "test/Echo", Qos::keep_all())
 }

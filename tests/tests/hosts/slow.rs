@@ -1,4 +1,4 @@
-//! What status says of a link that is slow, and why it is.
+//! Tests the status of a slow link, and the reason that it gives.
 
 use std::time::Duration;
 
@@ -16,7 +16,8 @@ use super::{
     process::{PATIENCE, until},
 };
 
-/// RELIABLE, and so many samples are kept. What a KEEP_ALL publisher cannot send waits in its own ring.
+/// Returns a RELIABLE QoS that keeps `depth` samples. Samples that a KEEP_ALL publisher cannot send wait in its own
+/// ring.
 fn keeping(depth: u32) -> Qos {
     Qos::default().with_depth(depth)
 }
@@ -57,7 +58,7 @@ fn waiting_bytes_are_shown_by_class_with_the_oldest_age() {
     wire.mend();
     let mut bytes = Vec::new();
     for (subscription, count) in [(&read_long, LONGS), (&read_short, SHORTS)] {
-        // What is overwritten meanwhile is another test's.
+        // Another test covers samples that are overwritten meanwhile.
         while subscription.recv(&mut bytes, Some(PATIENCE)).unwrap().sequence < u64::from(count) {}
     }
     let idle = shown(&hosts[0], "nothing waits", |link| link.waiting_bytes == 0);

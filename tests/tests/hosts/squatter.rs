@@ -62,7 +62,7 @@ fn a_pinned_peer_that_announces_gids_first_does_not_keep_their_owner_out() {
     let reader = camera.a.session("reader");
     let subscription = reader.create_subscription(spec(TOPIC)).unwrap();
     let owner = camera.b.session("owner");
-    // What is announced tells what the GIDs of its session are like.
+    // The announcement reveals the first bytes of the session's GIDs.
     let first = owner.create_publisher(spec("/first")).unwrap();
     until("the owner is known", || node_of(&reader, first.gid()).is_some());
 
@@ -82,7 +82,7 @@ fn a_pinned_peer_that_announces_gids_first_does_not_keep_their_owner_out() {
     until("the node is the one that its owner said", || {
         node_of(&reader, publisher.gid()).as_deref() == Some("")
     });
-    // Nothing was asked of the squatter, and its link goes on.
+    // The host asked nothing of the squatter, and its link goes on.
     assert_eq!(link.connection.close_reason(), None);
     camera.stranger.leave(&link);
     flows(&publisher, &subscription, 11);
@@ -127,7 +127,7 @@ fn proof_of_another_connection_or_daemon_is_refused() {
     };
     let left_out = |text: &str| text.contains("did not prove") && text.contains(&gid.to_string());
     let mut link = camera.link(0xff);
-    // What the owner would say on another connection, in the name of another daemon, or torn.
+    // The proofs are the owner's for another connection, in the name of another daemon, or with a broken signature.
     let daemon = DaemonId([0xff; 16]);
     let replayed = prove(&key, &[7; 32], daemon).unwrap();
     let torn = Proof { signature: [3; 64], ..replayed.clone() };
@@ -185,7 +185,7 @@ fn where_nothing_is_proved_the_first_address_has_a_gid_until_it_leaves() {
     a.wait_log(&["ignored endpoints announced by a peer", "another peer"]);
     assert_eq!(node_of(&reader, publisher.gid()).as_deref(), Some("squatter"));
     stranger.leave(&link);
-    // Its owner is asked again, without another link.
+    // The host asks the owner again, without another link.
     until("the owner has it", || node_of(&reader, publisher.gid()).as_deref() == Some(""));
     assert!(publisher.wait_matched(1, PATIENCE) && subscription.wait_matched(1, PATIENCE));
     flows(&publisher, &subscription, 1);

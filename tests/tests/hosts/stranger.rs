@@ -1,4 +1,4 @@
-//! Somebody who speaks the link protocol and is no daemon: what a hostile peer would say.
+//! A peer that speaks the link protocol and is not a daemon: it sends what a hostile peer could send.
 
 use std::{
     net::{Ipv4Addr, SocketAddr},
@@ -20,7 +20,7 @@ use quinn::{Connection, Endpoint, RecvStream, SendStream, TransportConfig};
 
 use super::{pair::Host, process::PATIENCE};
 
-/// Its daemon's id: the highest there is, so that elections are the other side's.
+/// The peer's daemon id: the highest possible, so that the other side decides elections.
 const ID: DaemonId = DaemonId([0xff; 16]);
 
 /// Returns a daemon id that is higher than a host's own, so that the host elects the stranger's links.
@@ -34,7 +34,7 @@ pub(crate) struct Stranger {
     runtime: tokio::runtime::Runtime,
 }
 
-/// A connection on which it said HELLO and was answered.
+/// A connection on which the stranger sent HELLO and got an answer.
 #[derive(Debug)]
 pub(crate) struct Met {
     pub(crate) connection: Connection,
@@ -42,7 +42,7 @@ pub(crate) struct Met {
     receive: RecvStream,
 }
 
-/// What it says of itself.
+/// The stranger's description of itself.
 pub(crate) struct Claim<'a> {
     pub(crate) host: &'a str,
     pub(crate) daemon: DaemonId,
@@ -84,7 +84,7 @@ impl Stranger {
         Ok(met)
     }
 
-    /// As [`dial`](Self::dial), under any daemon id: the lower one elects.
+    /// Dials like [`dial`](Self::dial), under any daemon id: the daemon with the lower id elects.
     pub(crate) fn dial_as(
         &self,
         host: &Host,
@@ -142,7 +142,7 @@ impl Stranger {
         self.say(met, &LinkMessage::Owners(Owners { proofs }));
     }
 
-    /// Says something; whether it arrives is for what comes next to tell.
+    /// Sends a message. The caller must check by other means whether it arrives.
     pub(crate) fn say(&self, met: &mut Met, message: &LinkMessage) {
         let frame = message.to_frame().unwrap();
         let _ = self.limited(met.send.write_all(&frame));
@@ -165,12 +165,12 @@ impl Stranger {
         })
     }
 
-    /// Waits until the other side has nothing more to say, which it may have without closing.
+    /// Waits until the other side sends nothing more, which it may do without closing.
     pub(crate) fn hear_out(&self, met: &mut Met) {
         self.limited(async { while next(&mut met.receive).await.is_some() {} });
     }
 
-    /// Says that nothing more will be said.
+    /// Ends the control stream: nothing more will be sent.
     pub(crate) fn end(&self, met: &mut Met) {
         let _ = met.send.finish();
     }
@@ -180,14 +180,14 @@ impl Stranger {
         self.limited(met.connection.open_uni()).map_err(|error| error.to_string())
     }
 
-    /// Writes for so long, as much of it as the other side lets it. Whether that is all.
+    /// Writes for `time`, as far as the other side permits. Returns whether all bytes were written.
     pub(crate) fn write_for(&self, stream: &mut SendStream, bytes: &[u8], time: Duration) -> bool {
         let write = async { tokio::time::timeout(time, stream.write_all(bytes)).await };
         // An error: the other side takes no more in that time, or stopped the stream.
         self.runtime.block_on(write).is_ok_and(|written| written.is_ok())
     }
 
-    /// Reads all streams of samples from now on. What came so far grows meanwhile.
+    /// Reads all streams of samples from now on. The returned buffer grows with the data that arrive.
     pub(crate) fn read_streams(&self, met: &Met) -> Arc<Mutex<Vec<u8>>> {
         let came = Arc::default();
         let (connection, all) = (met.connection.clone(), Arc::clone(&came));

@@ -29,7 +29,7 @@ use super::{
 
 const TOPIC: &str = "/unread";
 const SERVICE: &str = "/unanswered";
-/// What routes of a service carry, as SUBSCRIBE says it.
+/// The kinds of a service's routes in SUBSCRIBE.
 const REQUESTS: u8 = 1;
 const RESPONSES: u8 = 2;
 const TYPE: &str = "test/Bytes";
@@ -122,7 +122,7 @@ fn samples_of_a_relayed_session_that_a_peer_dropped_are_given_up() {
     claims_to_have_dropped(&host, &host.relayed_session("publisher"));
 }
 
-/// A peer that dropped samples of a publisher, and says so of more than it was sent.
+/// Tests a peer that claims to have dropped more samples of a publisher than it got.
 fn claims_to_have_dropped(host: &Host, session: &Session) {
     let publisher =
         session.create_publisher(EndpointSpec::new(TOPIC, TYPE, Qos::keep_all())).unwrap();
@@ -137,7 +137,7 @@ fn claims_to_have_dropped(host: &Host, session: &Session) {
     };
     for given_up in 1..=2 {
         let sequence = publisher.publish(b"sample").unwrap();
-        // What it acknowledges before it was sent counts for nothing: it says so again and again.
+        // An acknowledgement before the sample was sent does not count, so the peer repeats it.
         until("it is done with", || {
             say(sequence, u64::MAX);
             publisher.given_up() >= given_up
@@ -168,7 +168,7 @@ fn a_stopped_reader_behind_an_honest_daemon_is_served_again_once_it_reads() {
     let now = publisher.published();
     here.wait_taken(now + 100);
     signal(there.pid(), Signal::CONT);
-    // Other samples than those that were on their way when it was disconnected.
+    // These are other samples than those in flight at the disconnection.
     until("it is served again", || {
         hosts[1].status().links.iter().all(|link| link.routes_refused.is_empty())
     });
@@ -210,7 +210,7 @@ fn service() -> EndpointSpec {
     EndpointSpec::new(SERVICE, TYPE, Qos::keep_all())
 }
 
-/// What a peer does that takes nothing.
+/// The behaviour of a peer that takes nothing.
 #[derive(Clone, Copy, PartialEq)]
 enum Idler {
     /// It asks for the route.
@@ -221,7 +221,7 @@ enum Idler {
     Silent,
 }
 
-/// Asks for what goes to this end of the service.
+/// Asks for the messages to this end of the service.
 fn ask(stranger: &Stranger, met: &mut Met, kind: EndpointKind) {
     let subscribe = Subscribe {
         route: 1,

@@ -1,4 +1,4 @@
-//! What lies between two hosts: passes datagrams on, remembers them, and can be cut.
+//! A simulated wire between two hosts: forwards datagrams, records them, and can be cut.
 
 use std::{
     net::{SocketAddr, UdpSocket},
@@ -24,10 +24,10 @@ const LOSSY: u8 = 3;
 /// Values of ECN in the TOS byte: a packet that may be marked, and one that is.
 const ECN_CAPABLE: u8 = 2;
 const CONGESTION_EXPERIENCED: u8 = 3;
-/// A lossy wire drops one datagram in so many.
+/// A lossy wire drops one datagram in this many.
 const ONE_IN: u64 = 8;
 
-/// Whether the datagram of this number, with this first byte, gets through.
+/// Returns whether the datagram of this number, with this first byte, gets through.
 fn pass(passes: &AtomicU8, first: u8, number: u64) -> bool {
     match passes.load(Ordering::Relaxed) {
         ALL => true,
@@ -43,7 +43,7 @@ fn pass(passes: &AtomicU8, first: u8, number: u64) -> bool {
     }
 }
 
-/// What is remembered of both ends.
+/// The recorded datagrams of both ends.
 #[derive(Clone, Default)]
 struct Notes {
     handshakes: Arc<Mutex<Vec<Vec<u8>>>>,
@@ -59,7 +59,7 @@ impl Notes {
             true => (&self.handshakes, MOST_OF_HANDSHAKES),
             false => (&self.data, MOST_OF_DATA),
         };
-        // Relaxed: nothing else is told by it.
+        // Relaxed: the flag orders nothing else.
         if is_handshake || self.of_data.load(Ordering::Relaxed) {
             let mut notes = notes.lock().unwrap();
             if notes.len() < most {
@@ -71,11 +71,11 @@ impl Notes {
 
 /// Passes datagrams on between one client and one server.
 pub(crate) struct Wire {
-    /// Where the client finds the server.
+    /// The address at which the client finds the server.
     pub(crate) address: SocketAddr,
-    /// What speaks to the server.
+    /// The socket that sends to the server.
     pub(crate) towards: Arc<UdpSocket>,
-    /// What the client said.
+    /// The datagrams of the client.
     pub(crate) said: Arc<Mutex<Vec<Vec<u8>>>>,
     /// The datagrams of both that begin with a packet of a handshake.
     pub(crate) handshakes: Arc<Mutex<Vec<Vec<u8>>>>,
@@ -146,22 +146,22 @@ impl Wire {
         wire
     }
 
-    /// From now on remembers datagrams that are of no handshake, too.
+    /// Records from now on also datagrams that are not of a handshake.
     pub(crate) fn remember_data(&self) {
         self.notes.of_data.store(true, Ordering::Relaxed);
     }
 
-    /// From now on nothing gets through.
+    /// Drops all datagrams from now on.
     pub(crate) fn cut(&self) {
         self.passes.store(NOTHING, Ordering::Relaxed);
     }
 
-    /// From now on some datagrams do not get through.
+    /// Drops some datagrams from now on.
     pub(crate) fn lose(&self) {
         self.passes.store(LOSSY, Ordering::Relaxed);
     }
 
-    /// Marks what the client says as a congested router does.
+    /// Marks the client's packets as a congested router does.
     pub(crate) fn mark(&self) {
         rustix::net::sockopt::set_ip_tos(&self.towards, CONGESTION_EXPERIENCED).unwrap();
     }
@@ -171,8 +171,8 @@ impl Wire {
         self.passes.store(ALL, Ordering::Relaxed);
     }
 
-    /// Discovery gets through again, and new connections; what was connected when the wire was cut is
-    /// silent until there is one, as QUIC is in its longest pause.
+    /// Lets discovery and new connections through again. Connections from before the cut stay silent until there is a
+    /// new one, as QUIC is in its longest pause.
     pub(crate) fn mend_for_newcomers(&self) {
         self.passes.store(NEWCOMERS, Ordering::Relaxed);
     }

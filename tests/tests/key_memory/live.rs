@@ -11,7 +11,7 @@ pub(crate) fn bytes() -> usize {
     LIVE.load(Ordering::SeqCst)
 }
 
-/// To be held by each test from its start to its end: all threads are counted.
+/// Returns a lock that each test holds from its start to its end: all threads are counted.
 pub(crate) fn turn() -> MutexGuard<'static, ()> {
     static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
     ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner)
@@ -26,7 +26,7 @@ static COUNTING: Counting = Counting;
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         LIVE.fetch_add(layout.size(), Ordering::SeqCst);
-        // SAFETY: the caller's promises are those `System` asks for.
+        // SAFETY: the caller fulfils the contract of `GlobalAlloc`, which is that of `System`.
         unsafe { System.alloc(layout) }
     }
 

@@ -1,10 +1,10 @@
 //! Thousands of keys leave no trace on the heap: after each thousand, drawn in batches and dropped,
 //! a client, its slave and a pool have as many bytes in use as before.
 //!
-//! What is counted is what this process has in use by Rust's allocator, not what the system lends
-//! it. The KMEs run in a process of their own, since a KME that remembers what it gave grows.
+//! The test counts the bytes in use by Rust's allocator in this process, not the memory that the system gives the
+//! process. The KMEs run in a process of their own, since a KME that remembers its keys grows.
 //!
-//! Here and not with the crate, which forbids unsafe code: an allocator needs it.
+//! The tests are here and not with the crate, which forbids unsafe code: an allocator needs it.
 
 #[path = "../kmes/mod.rs"]
 mod kmes;
@@ -48,7 +48,7 @@ async fn no_growth(what: &str, mut round: impl AsyncFnMut()) {
     assert!(after.iter().max() <= before.iter().max(), "{what} grows: {used:?}");
 }
 
-/// One thread: what its tasks hold at rest is the same each time.
+/// Creates a runtime with one thread, so that its tasks hold the same memory at rest each time.
 fn runtime() -> Runtime {
     Builder::new_current_thread().enable_all().build().unwrap()
 }

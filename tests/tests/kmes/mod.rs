@@ -1,4 +1,4 @@
-//! Simulated KMEs in a process of their own: the memory of a KME is full of keys, and grows with what it
+//! Simulated KMEs in a process of their own: the memory of a KME is full of keys, and grows with the keys that it
 //! remembers.
 
 use std::io::{BufRead, BufReader, Write};
@@ -8,7 +8,7 @@ use std::process::{Child, ChildStdin, Command, Stdio};
 use etsi_qkd014::sim::Network;
 use etsi_qkd014::{Client, ClientBuilder, RetryPolicy};
 
-/// Tells the test binary that it is to be the KMEs, and where to write their certificates.
+/// The variable that makes the test binary run the KMEs, and that says where to write their certificates.
 const VARIABLE: &str = "AXON_TEST_KMES";
 
 /// The KMEs, which end with this.

@@ -7,20 +7,20 @@ use std::{
     process::{Child, ChildStdin, ChildStdout, Command, Stdio},
 };
 
-/// Tells the test binary what it is to do as the child.
+/// The variable that gives the test binary its task as the child.
 const VARIABLE: &str = "AXON_RESIDUE";
 
-/// In the child: what it is to do.
+/// In the child: returns the task.
 pub(crate) fn task() -> Option<String> {
     std::env::var(VARIABLE).ok()
 }
 
-/// In the child: standard input, without a buffer that would keep what was read.
+/// In the child: returns standard input, without a buffer that would keep the bytes that were read.
 pub(crate) fn input() -> File {
     std::io::stdin().as_fd().try_clone_to_owned().unwrap().into()
 }
 
-/// In the child: says that it has come so far, and waits to be searched.
+/// In the child: reports that it has reached this point, and waits until it has been searched.
 pub(crate) fn pause(input: &mut File) {
     std::io::stdout().write_all(b"paused\n").unwrap();
     input.read_exact(&mut [0]).unwrap();

@@ -43,7 +43,7 @@ fn run<A: Aead + 'static>() {
         opener.add_key(key_id(number), self::key(&mut input)).unwrap();
     }
     child::pause(&mut input);
-    // To another thread, where they are moved once more for each message.
+    // The keys go to another thread, where each message moves them once more.
     let spend = thread::spawn(move || {
         let mut opener = opener;
         for sealer in sealers {
@@ -105,7 +105,7 @@ fn needles(keys: &[[u8; 32]]) -> Needles {
     needles
 }
 
-/// What AES-GCM makes of nothing is the mask of its tag.
+/// The tag of AES-GCM for empty input is the mask of its tag.
 #[test]
 fn the_masks_of_tags_are_those_of_aes_gcm() {
     let key = random_keys()[0];

@@ -1,4 +1,4 @@
-//! A server with a certificate of its own making, and a client that takes any: what authenticates a peer has no part in
+//! A server with a self-made certificate, and a client that accepts any: the authentication of a peer has no part in
 //! the secrets.
 
 use std::sync::Arc;

@@ -20,11 +20,12 @@ use crate::transcript::{Messages, TappedServer};
 
 /// Set in the environment of the child: cipher, mode, and which ends it has.
 pub(crate) const ASKED: &str = "AXON_TLS_MEMORY_CHILD";
-/// What it says in front of the port of its server, where it has a server alone.
+/// Prefix of the line with the server's port, if the child has only the server.
 pub(crate) const LISTENS: &str = "listens: ";
-/// What the child says in front of its transcript, if it has both ends, when it is connected and data was exchanged.
+/// Prefix of the line with the transcript, if the child has both ends. The child prints it when it is connected and
+/// data was exchanged.
 pub(crate) const CONNECTED: &str = "connected: ";
-/// What it says when everything that had a secret is dropped.
+/// Prefix of the line that the child prints when it has dropped everything with a secret.
 pub(crate) const DROPPED: &str = "dropped: ";
 
 pub(crate) const KEY_ID: &str = "bc490419-7d60-487f-adc1-4ddcc177c139";
@@ -33,7 +34,7 @@ pub(crate) const SERVER_SAE: &str = "sae-server";
 pub(crate) const EXPORTER: &str = "EXPORTER-axon-test";
 const SENT: usize = 70_000;
 
-/// What both ends have in common.
+/// The terms that both ends share.
 pub(crate) fn terms(cipher: Cipher, mode: Mode, key: &[u8]) -> Terms<'_> {
     Terms { cipher, mode, key, key_id: KEY_ID, client: CLIENT_SAE, server: SERVER_SAE }
 }
@@ -57,7 +58,7 @@ impl fmt::Display for Has {
     }
 }
 
-/// What the child leaves in memory on purpose, from the key that it is given.
+/// Returns the values that the child leaves in memory on purpose, from the key that it gets.
 pub(crate) fn marks(key: &[u8; 32]) -> [[u8; 32]; 2] {
     [0x55, 0xaa].map(|mask| key.map(|byte| byte ^ mask))
 }
@@ -156,7 +157,7 @@ fn psk(key: &[u8; 32], cipher: Cipher) -> Psk {
     derive_psk(key, KEY_ID, CLIENT_SAE, SERVER_SAE, cipher).unwrap()
 }
 
-/// How long a closed connection is waited for depends on the round trip.
+/// Returns a transport with a short initial round trip, which determines how long a closed connection is kept.
 fn transport() -> Arc<TransportConfig> {
     let mut transport = TransportConfig::default();
     transport.initial_rtt(Duration::from_millis(20));

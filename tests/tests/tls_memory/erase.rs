@@ -1,4 +1,5 @@
-//! What axon-tls does around its glue. This process may keep what it knows: only the child's memory is looked at.
+//! Stubs of the functions of axon-tls that erase the stack. They erase nothing: this process may keep its secrets, because
+//! only the child's memory is searched.
 
 pub(crate) fn erasing_stack<T>(work: impl FnOnce() -> T) -> T {
     work()

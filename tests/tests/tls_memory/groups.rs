@@ -1,11 +1,11 @@
-//! The group of AXON, in a form that tells the shared secret of each key exchange.
+//! The key exchange group of AXON, in a form that reveals the shared secret of each key exchange.
 
 use std::sync::{Arc, Mutex};
 
-/// What the last key exchange gave.
+/// The result of the last key exchange.
 pub(crate) type Told = Arc<Mutex<Vec<u8>>>;
 
-/// A group that tells the shared secret, in the types of one of the two rustls.
+/// A group that reveals the shared secret, in the types of one of the two rustls.
 macro_rules! tapped_group {
     ($name:ident, $tls:ident) => {
         pub(crate) mod $name {

@@ -1,11 +1,11 @@
-//! Which secrets of a TLS connection are left in the memory of the process that had it.
+//! Tests which secrets of a TLS connection stay in the memory of its process.
 //!
-//! A child process derives a pre-shared key from a QKD key and connects to itself over QUIC, as two
-//! daemons do. This process knows the QKD key, is told the handshake messages, computes every secret
-//! of the key schedule by RFC 8446 section 7 by itself, and looks for each of them in all writable
-//! memory of the child: stacks, heap, and what was freed.
+//! A child process derives a pre-shared key from a QKD key and connects to itself over QUIC, as two daemons do. This
+//! process knows the QKD key, and gets the handshake messages from the child. It computes every secret of the key
+//! schedule by RFC 8446 section 7 itself. It searches for each secret in all writable memory of the child: stacks,
+//! heap, and freed memory.
 //!
-//! Where there is a key exchange, the child has one end, and this process the other: a group of the test takes the
+//! With a key exchange, the child has one end, and this process the other: a key exchange group of the test gets the
 //! shared secret there.
 
 #[path = "../../../axon-tls/tests/common/anybody.rs"]
@@ -55,7 +55,7 @@ impl Examined {
         Self { process, to, from }
     }
 
-    /// Waits until the child is at a step, and gives what it says there.
+    /// Waits until the child is at a step, and returns the text that it prints there.
     fn at(&mut self, step: &str) -> String {
         let mut line = String::new();
         loop {
@@ -71,7 +71,7 @@ impl Examined {
         self.to.write_all(&[1]).unwrap();
     }
 
-    /// What of `secrets` is in the memory of the child by now.
+    /// Returns which of `secrets` are in the memory of the child now.
     fn left(&self, secrets: &[Secret]) -> Vec<String> {
         Needles::of(secrets).found_in(self.process.id())
     }
@@ -215,7 +215,7 @@ fn nothing_is_left_of_a_server_in_psk_dhe_ke() {
     nothing_is_left_of_one_end(Mode::Psk(PskKex::PskDheKe), false);
 }
 
-/// The shared secret, and what is extracted from it and expanded for the next step, are nowhere.
+/// The shared secret, and the secrets extracted from it and expanded for the next step, are not in memory.
 #[test]
 fn a_hybrid_client_leaves_only_secrets_that_rustls_holds() {
     nothing_is_left_of_one_end(Mode::Hybrid, true);

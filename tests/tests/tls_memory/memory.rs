@@ -6,7 +6,7 @@ use std::os::unix::fs::FileExt;
 
 use axon_tests::schedule::Secret;
 
-/// How much of a secret counts as a find.
+/// Number of bytes of a secret that count as a find.
 const PIECE: usize = 8;
 const CHUNK: usize = 1 << 20;
 

@@ -24,7 +24,7 @@ use crate::transcript::{Messages, TappedClient, TappedServer};
 
 const LOCALHOST: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0);
 
-/// What both ends of a connection have in common.
+/// The terms that both ends of a connection share.
 #[derive(Clone, Copy)]
 pub(crate) struct Terms<'a> {
     pub(crate) cipher: Cipher,
@@ -32,7 +32,7 @@ pub(crate) struct Terms<'a> {
     pub(crate) psk: &'a [u8],
 }
 
-/// The end of this process, which says what it learnt.
+/// The end of this process, which reports its secrets.
 pub(crate) struct TappedEnd {
     told: Told,
     messages: Messages,
@@ -40,11 +40,11 @@ pub(crate) struct TappedEnd {
     endpoint: Endpoint,
 }
 
-/// What an end learnt.
+/// The secrets of an end.
 pub(crate) struct Learnt {
     /// ClientHello to the client's Finished.
     pub(crate) transcript: Vec<u8>,
-    /// What the key exchange gave.
+    /// The result of the key exchange.
     pub(crate) shared: Vec<u8>,
 }
 

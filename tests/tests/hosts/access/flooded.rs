@@ -17,7 +17,7 @@ use super::{super::greedy::Camera, *};
 
 /// Endpoints that come, and go, in one message.
 const PART: u32 = 500;
-/// How often rules change.
+/// Number of changes of the rules.
 const ROUNDS: usize = 5;
 
 const OPEN: &str = "default = \"allow\"";
@@ -29,7 +29,7 @@ fn flood(camera: &Camera, over: &AtomicBool, said: &AtomicU64) {
     let mut link = camera.link(0xff);
     camera.stranger.prove(&mut link, DaemonId([0xff; 16]), &[&key]);
     let mut version = 0;
-    // Relaxed, here and below: nothing else is told by it.
+    // Relaxed, here and below: the flag orders nothing else.
     while !over.load(Relaxed) {
         let first = (version as u32 / 2) * PART;
         let gids = (first..first + PART).map(|number| Gid::new(key.id(), 1 + number));
@@ -92,7 +92,7 @@ fn no_sample_published_after_rules_deny_it_arrives_under_a_graph_flood() {
             until("its publisher hears of it", || drives.matched().is_empty());
             assert!(!drive.has_data());
             camera.set_rules(OPEN);
-            // The publisher keeps its history: what was denied arrives now that it is allowed.
+            // The publisher keeps its history: samples that were denied arrive now that they are allowed.
             for _ in 0..100 {
                 drive.recv(&mut bytes, Some(PATIENCE)).expect("history");
             }

@@ -122,7 +122,7 @@ fn samples_beyond_a_limit_wait_or_count_as_dropped_in_each_mode() {
 const LENGTH: usize = 10_000;
 
 fn publish_long(publisher: &Publisher) {
-    // A slow link carries as many bytes as there are.
+    // The payload does not compress, so a slow link carries all of its bytes.
     let noise = noise(LENGTH);
     for number in 1..=SAMPLES {
         let mut sample = noise.clone();
@@ -265,7 +265,7 @@ fn an_egress_limit_of_an_interface_slows_samples_and_loses_none() {
     egress_is_limited("interface = \"lo\"", "(all packets by lo)");
 }
 
-/// A limit of what leaves the robot, by peer or interface, with the name that status gives it.
+/// Tests a limit on the robot's outgoing packets, by peer or interface. Status shows the limit as `name`.
 fn egress_is_limited(whose: &str, name: &str) {
     // All samples take two hundred seconds.
     let rules = format!("default = \"allow\"\n[[limit]]\n{whose}\negress = \"10 kB/s\"\n");
@@ -280,7 +280,7 @@ fn egress_is_limited(whose: &str, name: &str) {
     hosts.write(&rules);
     assert_eq!(hosts.reload().error, None);
     publish_long(&scan);
-    // What comes in is not limited.
+    // Incoming packets are not limited.
     publish(&drives);
     for number in 1..=SAMPLES {
         assert_eq!(next(&drive), number);

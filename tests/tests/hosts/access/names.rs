@@ -68,7 +68,7 @@ fn certificate_with_two_names_gets_the_rights_of_the_selected_name() {
     let material = CaMaterial::from_pem(&ca.pem, &both.pem, &both.key, None).unwrap();
     let auth = Auth::Ca(Arc::new(material.with_names_checked_by_application()));
     let stranger = Stranger::new();
-    // Its host may be both at once: each link has the rights of its name.
+    // A host may have both names at once: each link has the rights of its name.
     let keys = [(); 2].map(|()| SessionKey::generate().unwrap());
     let mut links = [("guest", 0xfe), ("base", 0xff)].map(|(name, id)| {
         let claim = Claim { daemon: DaemonId([id; 16]), ..Claim::ca(name) };

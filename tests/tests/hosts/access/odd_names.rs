@@ -1,4 +1,4 @@
-//! Names that look like others, or are none: rules decide by each byte of them, whatever a peer announces.
+//! Tests names that look like others, or are not valid: rules compare every byte of any name that a peer announces.
 
 use std::collections::BTreeSet;
 
@@ -11,7 +11,7 @@ use axon_transport::{
 
 use super::{super::greedy::Camera, *};
 
-/// Of the camera: one topic by its name, one whose name is not ASCII, and all below a third.
+/// Rules for the camera: one topic by its name, one whose name is not ASCII, and all topics below a third name.
 const RULES: &str = r#"
 default = "deny"
 
@@ -25,7 +25,7 @@ subscribe = ["/cmd_vel", "/größe", "/open/**"]
 const PERMITTED: [&str; 7] =
     ["/größe", "/open", "/open/", "/open//x", "/open/日本/🤖", "/open/ /..", "/cmd_vel"];
 
-/// Names that they do not, though each looks like one of those.
+/// Returns names that the rules deny, though each looks like an allowed one.
 fn denied() -> Vec<String> {
     let mut names: Vec<String> = [
         "/cmd_vel/",
@@ -59,7 +59,7 @@ fn denied() -> Vec<String> {
     names
 }
 
-/// The camera's endpoints of these topics.
+/// Creates the camera's endpoints of these topics.
 fn endpoints<'a>(
     key: &SessionKey,
     names: impl Iterator<Item = &'a str>,

@@ -6,7 +6,8 @@ use axon_daemon::internal::shared_group;
 
 use super::*;
 
-/// Two hosts without peers. Whoever is not listed is not found. The settings of the first are in its `axon.toml`.
+/// Prepares two hosts that list no peers. A host that is not listed is not found. The settings of the first are in its
+/// `axon.toml`.
 fn unlisted() -> [Host; 2] {
     let plan = Plan { listed: false, ..Plan::new([classic(&[]), classic(&[])]) };
     let mut hosts = plan.prepare();
@@ -18,7 +19,7 @@ fn unlisted() -> [Host; 2] {
     hosts
 }
 
-/// Writes `axon.toml` of a host, and has its daemon read it. Returns what changed.
+/// Writes `axon.toml` of a host, and makes its daemon read it. Returns the changed settings.
 fn rewrite(host: &Host, toml: &str) -> Vec<String> {
     fs::write(host.dir.path().join("axon.toml"), toml).unwrap();
     let report = daemon_reload_at(&DaemonLocation::from(&host.config())).unwrap();
@@ -69,7 +70,7 @@ fn a_peer_that_is_listed_without_a_port_while_the_daemon_runs_is_linked() {
 fn links_once_listed(name_of: impl Fn(&Host) -> String) {
     let plan = Plan { listed: false, ..Plan::new([classic(&[]), classic(&[])]) };
     let [mut a, mut b] = plan.prepare();
-    // A program that shares the port with nobody: the daemons find each other by their lists alone.
+    // This socket does not share its port, so the daemons find each other only by their lists.
     let group = shared_group(a.domain());
     let _alone = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, group.port())).unwrap();
     a.unset("AXON_DAEMON_PEERS");

@@ -81,7 +81,7 @@ fn another_user_of_the_host_publishes_only_on_allowed_topics() {
     robot.wait_refusal("the daemon says which rule denies", |refusal| {
         refusal.contains("\"/denied\": denied: no [[allow]] in access.toml permits this")
     });
-    // So does the program itself, which does not see the daemon's log.
+    // The program itself logs it as well, because it does not see the daemon's log.
     let said =
         ["the daemon refuses an endpoint", "/denied", "no [[allow]] in access.toml permits this"];
     robot.wait_log(&said);
@@ -99,7 +99,7 @@ fn another_user_of_the_host_publishes_only_on_allowed_topics() {
     drop((denied_node, allowed_node));
 }
 
-/// Samples of the node's kind, of which the first so many were published.
+/// A publisher of the node's kind of samples, and the number of the samples that were published.
 struct Numbers(Publisher, u64);
 
 impl Numbers {
@@ -204,7 +204,7 @@ fn samples_of_and_for_another_user_end_when_rules_deny_them_while_they_flow() {
     until("the other user goes on", || writes.published() > published + 200);
     assert_eq!(reads[0].tally().last, 10, "what was published after the pair ended");
     assert!(!comes.has_data());
-    // It is told why.
+    // The peer gets the reason.
     host.wait_refusal("the daemon says what is denied", |text| {
         text.contains("\"/in\": denied: no [[allow]] in access.toml permits this")
     });

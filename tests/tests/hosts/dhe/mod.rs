@@ -1,8 +1,10 @@
-//! What a connection in `psk_dhe_ke` leaves behind in the memory of a daemon that accepted it, and of one that dialled.
+//! Tests which secrets a connection in `psk_dhe_ke` leaves in the memory of a daemon that accepted it, and of one that
+//! dialled.
 //!
-//! This process is the other end. It knows the key, and a group of its own tells the shared secret of the key exchange;
-//! with both, the recorded handshake gives all other secrets ([`recorded`](super::recorded)). A daemon that dials may have
-//! given up another dial under the same key, which keeps the PSK until its connection is closed (`docs/security.md`).
+//! This process is the other end. It knows the key, and a key exchange group of the test reveals the shared secret.
+//! With both, all other secrets follow from the recorded handshake ([`recorded`](super::recorded)). A daemon that dials
+//! may have given up another dial under the same key, which keeps the PSK until its connection is closed
+//! (`docs/security.md`).
 
 mod tapped;
 
@@ -61,7 +63,7 @@ struct Link {
     told: Told,
 }
 
-/// The connection, what leads to it, and its control stream.
+/// The connection, its wire and endpoint, and its control stream.
 struct Stands {
     wire: Wire,
     endpoint: Endpoint,

@@ -1,4 +1,4 @@
-//! Ends in `psk_dhe_ke` that tell the shared secret of their key exchange.
+//! Ends in `psk_dhe_ke` that reveal the shared secret of their key exchange.
 
 use std::{fmt, sync::Arc};
 
@@ -20,7 +20,7 @@ use crate::{
     quic,
 };
 
-/// What is agreed on in all of these tests.
+/// The mode of all of these tests.
 pub(super) const MODE: Mode = Mode::Psk(PskKex::PskDheKe);
 
 fn provider(cipher: Cipher, told: &Told) -> Arc<CryptoProvider> {

@@ -36,7 +36,7 @@ impl Authority {
         self.issue_for(&[name], serial, until)
     }
 
-    /// As [`issue`](Self::issue), for several DNS names.
+    /// Issues a certificate like [`issue`](Self::issue), for several DNS names.
     pub(crate) fn issue_for(&self, names: &[&str], serial: u64, until: i32) -> Certificate {
         let names: Vec<_> = names.iter().map(|name| (*name).to_owned()).collect();
         let mut params = CertificateParams::new(names).unwrap();

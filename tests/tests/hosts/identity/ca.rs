@@ -14,7 +14,7 @@ use super::{
     authority::{Authority, Certificate, settings},
 };
 
-/// Serial numbers of host A, of host B and of nobody.
+/// Serial numbers of host A, of host B and of no host.
 const A: u64 = 1;
 const B: u64 = 2;
 const NOBODY: u64 = 9;
@@ -27,7 +27,7 @@ fn start(dir: &Path, ca: &Authority, b: &Certificate, crl: Option<&str>) -> [Hos
     Plan::new([a, b]).start()
 }
 
-/// Neither host links, and each says why.
+/// Checks that neither host links, and that each reports the reason.
 fn refused(hosts: &[Host; 2], why: &str) {
     for host in hosts {
         host.wait_refusal(why, |text| text.contains(why));
@@ -62,7 +62,7 @@ fn hosts_of_one_ca_link_and_deliver() {
 fn a_certificate_of_another_ca_is_refused() {
     let dir = tempfile::tempdir().unwrap();
     let (ca, other) = (Authority::new("the CA"), Authority::new("another CA"));
-    // Both ends have a say: B would take A.
+    // Both ends decide: B would accept A.
     let b = other.issue("host-b", B, 2100);
     refused(&start(dir.path(), &ca, &b, None), "trusted");
 }
@@ -72,7 +72,7 @@ fn a_certificate_that_ran_out_is_refused() {
     let (dir, ca) = (tempfile::tempdir().unwrap(), Authority::new("the CA"));
     let hosts = start(dir.path(), &ca, &ca.issue("host-b", B, 2021), None);
     refused(&hosts, "expired");
-    // Its owner hears of it without having to ask a peer.
+    // The log of the host reports it, so that the owner need not ask a peer.
     hosts[1].wait_log(&["this host's own certificate is not accepted"]);
 }
 
@@ -105,7 +105,7 @@ fn a_reloaded_revocation_list_ends_the_link_of_a_revoked_peer() {
     a.link();
     b.link();
 
-    // A list of somebody else is no list: the link stays, and nobody new gets one.
+    // A revocation list of another CA is not valid: the link stays, and no new peer gets one.
     fs::write(&crl, Authority::new("another CA").revoke(NOBODY, 2100)).unwrap();
     a.wait_log(&["no new link is accepted", "AXON_CLASSIC_CRL", "none is of one of the roots"]);
     assert_eq!(a.status().links.len(), 1);

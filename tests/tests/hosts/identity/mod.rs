@@ -1,4 +1,4 @@
-//! Who a peer is, in `classic`: what is accepted, and what changes while the daemons run.
+//! Tests the identity of peers in `classic`: which are accepted, and changes while the daemons run.
 
 use axon_transport::ids::DaemonId;
 

@@ -64,7 +64,7 @@ fn a_key_is_changed_while_both_daemons_run() {
     wait_key(&a, &digest(&old));
     let mut publisher = b.publish(Sizes::Small, 1, None);
 
-    // The second pin; what starts on this host from now on has read the new file.
+    // The second pin; processes that start on this host from now on read the new file.
     replace(&trust, &(old.clone() + &new_line));
     let mut subscriber = a.subscribe(Sizes::Small);
     subscriber.wait_taken(50);
@@ -175,7 +175,7 @@ fn strangers_get_no_link_and_pinned_peers_cannot_take_another_identity() {
     fs::write(&trust, both).unwrap();
     let [a, b] = Plan::new(settings).start();
     let daemon = a.link().peer;
-    // Whom it trusts is all the same to it.
+    // The owner's trust does not matter here, so it trusts any peer.
     let anybody = Trust::new(TrustFile::parse(&line("a", &dir.path().join("host-0.key"))).unwrap());
     let as_owner = |key: SigningKey| Auth::Pinned { key, trust: anybody.clone() };
     let stranger = Stranger::new();
@@ -188,11 +188,11 @@ fn strangers_get_no_link_and_pinned_peers_cannot_take_another_identity() {
     stranger.dial(&a, &revealed, &Claim::pinned("host-1")).expect_err("an ephemeral key");
 
     let camera = as_owner(SigningKey::from_pem(&fs::read_to_string(&camera).unwrap()).unwrap());
-    // Another daemon's id is taken, whatever peer asks for it.
+    // The id of another daemon is taken, for every peer that asks for it.
     let claim = Claim { daemon: super::daemon_id(&daemon), ..Claim::pinned("host-1") };
     let why = stranger.dial(&a, &camera, &claim).expect_err("B's id");
     assert!(why.contains("that of another host"), "{why}");
-    // Under an id of its own it is who its pin says, whatever it calls itself.
+    // Under an id of its own the peer has the name of its pin, even if it states another one.
     let link = stranger.dial(&a, &camera, &Claim::pinned("host-1")).expect("a pinned key");
     until("A knows it by its pin", || {
         let links = a.status().links;

@@ -41,7 +41,8 @@ fn replayed_handshake_packets_make_no_second_link() {
     let said = wire.said.lock().unwrap().clone();
     assert!(said.len() >= 4, "two Initials, a Handshake and a HELLO at least: {}", said.len());
 
-    // From elsewhere while the link stands, and from its own address when it is over.
+    // The datagrams come from another address while the link stands, and from the original address when the link is
+    // over.
     let elsewhere = UdpSocket::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
     for datagram in said.iter().cycle().take(5 * said.len()) {
         elsewhere.send_to(datagram, server).unwrap();

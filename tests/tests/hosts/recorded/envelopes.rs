@@ -1,4 +1,4 @@
-//! The nonces of envelopes, as somebody who recorded the packets of a connection can read them.
+//! The nonces of envelopes, as an eavesdropper can read them from the recorded packets of a connection.
 
 use std::collections::BTreeMap;
 
@@ -11,20 +11,20 @@ use crate::wire::Wire;
 /// The nonces that were read so far.
 #[derive(Default)]
 pub(crate) struct Nonces {
-    /// By the key_ID: what the nonces of the key begin with.
+    /// The prefix of a key's nonces, by the key_ID.
     prefixes: BTreeMap<String, [u8; 8]>,
-    /// How many datagrams of the wire were read.
+    /// Number of datagrams of the wire that were read.
     read: usize,
-    /// Of each end of each connection: what opens its packets before and after key updates, and the number that is expected
-    /// next. QUIC updates the keys of a connection early on, after a random number of packets.
+    /// For each end of each connection: the keys of its packets before and after key updates, and the next expected
+    /// packet number. QUIC updates the keys of a connection early, after a random number of packets.
     ends: Vec<([Opens; 3], u64)>,
-    /// How many connections these are of.
+    /// Number of these connections.
     connections: usize,
 }
 
 impl Nonces {
-    /// Reads what the wire has seen since the last time. Envelopes whose headers are in two packets are not read: their
-    /// keys have others. `connections` are as many as the last time, or more.
+    /// Reads the datagrams that the wire has recorded since the last time. Envelopes whose headers are in two packets
+    /// are not read: other envelopes have the same keys. `connections` are as many as the last time, or more.
     pub(crate) fn read(&mut self, wire: &Wire, cipher: Cipher, connections: &[Connection]) {
         for connection in &connections[self.connections.min(connections.len())..] {
             let ends = connection.traffic.each_ref();
@@ -53,7 +53,7 @@ impl Nonces {
         }
     }
 
-    /// What the nonces of this key begin with, if envelopes under it were read.
+    /// Returns the prefix of this key's nonces, if envelopes under the key were read.
     pub(crate) fn prefix(&self, key_id: &str) -> Option<[u8; 8]> {
         self.prefixes.get(key_id).copied()
     }

@@ -1,7 +1,7 @@
-//! The secrets of connections in `qkd`, computed by somebody who recorded their handshakes and has the KME's keys.
+//! Computes the secrets of connections in `qkd` from the recorded handshakes and the KME's keys.
 //!
-//! In `psk_ke` nothing else comes into them: there is no key exchange. So both ends can be daemons as they are released,
-//! which tell their secrets to nobody. In `psk_dhe_ke` one end has to tell the shared secret of the key exchange.
+//! In `psk_ke` no other input is needed, because there is no key exchange. So both ends can be released daemons, which
+//! reveal no secret. In `psk_dhe_ke` one end has to reveal the shared secret of the key exchange.
 
 mod envelopes;
 mod packets;
@@ -28,13 +28,13 @@ const SIGNED: &str = "EXPORTER-axon-session-owner";
 
 /// The secrets of a connection that was established.
 pub(crate) struct Connection {
-    /// Those that it uses as long as it stands.
+    /// Secrets that the connection uses as long as it stands.
     pub(crate) in_use: Vec<Secret>,
     /// The others.
     pub(crate) used_up: Vec<Secret>,
-    /// Its key.
+    /// The key_ID of the connection's key.
     pub(crate) key_id: String,
-    /// What the envelope's exporter gave.
+    /// The output of the envelope's exporter.
     pub(crate) context: Vec<u8>,
     /// The first traffic secret and those of the next key updates, the client's and the server's.
     traffic: [[Vec<u8>; 3]; 2],
@@ -71,7 +71,7 @@ impl Connection {
         Self { in_use, used_up, key_id: terms.key_id.to_owned(), context, traffic }
     }
 
-    /// Adds its secrets to what is searched for, as of the kinds [`IN_USE`] and [`USED_UP`].
+    /// Adds the connection's secrets to the needles, with the kinds [`IN_USE`] and [`USED_UP`].
     pub(crate) fn add_to(&self, needles: &mut Needles, number: usize) {
         for (kind, secrets) in [(IN_USE, &self.in_use), (USED_UP, &self.used_up)] {
             for secret in secrets {
@@ -86,7 +86,7 @@ pub(crate) const IN_USE: &str = "secret of a connection";
 /// Secrets that a connection has no use for.
 pub(crate) const USED_UP: &str = "secret of a connection's handshake";
 
-/// What each end of a connection sent of its handshake: the client and the server.
+/// The handshake bytes of each end of a connection: the client and the server.
 #[derive(Default)]
 struct Streams([Stream; 2]);
 
@@ -104,8 +104,8 @@ impl Streams {
     }
 }
 
-/// The connections whose handshakes the wire has seen from beginning to end, in `psk_ke`, or with what the key exchange
-/// gave in `psk_dhe_ke`.
+/// Returns the connections whose handshakes the wire has recorded from beginning to end. In `psk_dhe_ke`, `shared` is
+/// the result of the key exchange.
 pub(crate) fn connections(
     wire: &Wire,
     cipher: Cipher,

@@ -1,4 +1,4 @@
-//! The packets of handshakes, as RFC 9000 and RFC 9001 have them, and what CRYPTO frames carry.
+//! Parses the packets of handshakes by RFC 9000 and RFC 9001, and collects the content of CRYPTO frames.
 
 use std::collections::BTreeMap;
 
@@ -28,7 +28,7 @@ pub(super) struct Packet<'a> {
     /// The connection ID of its receiver.
     pub(super) destination: &'a [u8],
     bytes: &'a [u8],
-    /// Where its number is.
+    /// The position of the packet number.
     number_at: usize,
 }
 
@@ -70,8 +70,8 @@ pub(super) fn packets(datagram: &[u8]) -> Vec<Packet<'_>> {
     found
 }
 
-/// The first packet of these bytes, if it is of use, and its length; `None` at a short header, at padding, and at packets
-/// that extend to the end of the datagram.
+/// Returns the first packet of these bytes, if it is of use, and its length. Returns `None` at a short header, at
+/// padding, and at packets that extend to the end of the datagram.
 fn packet(bytes: &[u8]) -> Option<(Option<Packet<'_>>, usize)> {
     let mut from = Bytes(bytes);
     let first = from.byte()?;
@@ -100,7 +100,7 @@ fn packet(bytes: &[u8]) -> Option<(Option<Packet<'_>>, usize)> {
     Some((kind.map(|kind| Packet { kind, destination, bytes, number_at }), whole))
 }
 
-/// What opens the packets of one end.
+/// The keys that open the packets of one end.
 pub(super) struct Opens {
     packet: Box<dyn PacketKey>,
     header: Box<dyn HeaderProtectionKey>,
@@ -142,7 +142,7 @@ impl Opens {
 
     /// The frames of a packet; `None` if it is not one of that end.
     pub(super) fn open(&self, packet: &Packet<'_>) -> Option<Vec<u8>> {
-        // Those of a handshake are so few that their numbers are whole.
+        // A handshake has so few packets that their numbers are not truncated.
         let frames = self.open_at(packet.bytes, packet.number_at, 0);
         frames.map(|(_, frames)| frames)
     }
@@ -188,7 +188,7 @@ fn whole_number(end: u64, window: u64, next: u64) -> u64 {
 pub(super) struct Stream(BTreeMap<usize, Vec<u8>>);
 
 impl Stream {
-    /// Adds what the CRYPTO frames of a packet carry.
+    /// Adds the content of a packet's CRYPTO frames.
     pub(super) fn add(&mut self, frames: &[u8]) {
         let mut from = Bytes(frames);
         while self.frame(&mut from).is_some() {}
@@ -221,7 +221,7 @@ impl Stream {
         Some(())
     }
 
-    /// What has come without a gap.
+    /// Returns the bytes up to the first gap.
     pub(super) fn bytes(&self) -> Vec<u8> {
         let mut whole = Vec::new();
         for (at, bytes) in &self.0 {

@@ -1,10 +1,11 @@
-//! What a link in `classic` leaves behind in the memory of a daemon that accepted it, and of one that dialled: the secrets
-//! of the key schedule of TLS, and the keys of QUIC's packets.
+//! Tests which secrets a link in `classic` leaves in the memory of a daemon that accepted it, and of one that dialled:
+//! the secrets of the key schedule of TLS, and the keys of QUIC's packets.
 //!
-//! This process is the other end of the link. A group of its own tells the shared secret of the key exchange, and what it
-//! reads and writes tells the messages of the handshake; all other secrets follow from these (RFC 8446, section 7.1, and RFC
-//! 9001, section 5.1). While the link stands its keys have to be somewhere: that they are found shows that the search
-//! works, and they are on no stack. Once it has ended they are nowhere: heap, freed heap, stacks.
+//! This process is the other end of the link. A key exchange group of the test reveals the shared secret of the key
+//! exchange, and the data that this process reads and writes contain the messages of the handshake. All other secrets
+//! follow from these (RFC 8446, section 7.1, and RFC 9001, section 5.1). While the link stands its keys must be in
+//! memory: that they are found shows that the search works. They are on no stack. Once the link has ended they are
+//! nowhere: neither in the heap, nor in freed heap, nor on stacks.
 
 mod tapped;
 
@@ -49,7 +50,7 @@ const HELD_BY_RUSTLS: [&str; 4] = [
     "client traffic secret 0",
     "server traffic secret 0",
 ];
-/// What is exported in these tests, to show that the secrets are those of the connection.
+/// The label that these tests export, to show that the secrets are those of the connection.
 const EXPORTER: &str = "EXPORTER-axon-test";
 
 /// HKDF-Expand-Label of RFC 8446, section 7.1, without a context.
@@ -73,7 +74,7 @@ enum Auth {
     Ca,
 }
 
-/// The settings of two hosts, and what this process shows as the second of them.
+/// Returns the settings of two hosts, and the credentials of this process as the second of them.
 fn settings(dir: &Path, auth: Auth) -> ([Settings; 2], Own) {
     let pem = || SigningKey::generate_pem_with(KeyAlgorithm::Ed25519).unwrap().to_string();
     match auth {
@@ -99,14 +100,14 @@ fn settings(dir: &Path, auth: Auth) -> ([Settings; 2], Own) {
     }
 }
 
-/// What stands.
+/// A link that stands.
 struct Stands {
     endpoint: Endpoint,
     connection: Connection,
     control: (SendStream, RecvStream),
 }
 
-/// This process dials the daemon of `host`.
+/// Dials the daemon of `host` from this process.
 async fn dial(host: &Host, config: quinn::ClientConfig) -> Stands {
     let daemon = SocketAddr::from((host.address, host.status().port.unwrap()));
     let endpoint = Endpoint::client((Ipv4Addr::UNSPECIFIED, 0).into()).unwrap();

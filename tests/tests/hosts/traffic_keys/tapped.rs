@@ -1,4 +1,4 @@
-//! Ends in `classic` that tell the shared secret of their key exchange, and the messages of their handshake.
+//! Ends in `classic` that reveal the shared secret of their key exchange, and the messages of their handshake.
 
 use std::sync::Arc;
 
@@ -23,16 +23,16 @@ use crate::{
     transcript::{Messages, TappedClient, TappedServer},
 };
 
-/// What an end learns.
+/// The secrets of an end.
 #[derive(Default)]
 pub(super) struct Learnt {
-    /// What the key exchange gave.
+    /// The result of the key exchange.
     pub(super) shared: Told,
     /// ClientHello to the client's Finished.
     pub(super) transcript: Messages,
 }
 
-/// What an end shows of itself, as PEM. It accepts anybody.
+/// The credentials of an end, as PEM. The end accepts any peer.
 pub(super) struct Own {
     pub(super) key: String,
     /// `None`: a raw public key (RFC 7250) is shown.
