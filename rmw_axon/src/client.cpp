@@ -99,7 +99,7 @@ rmw_ret_t rmw_take_response(
         return;
       }
       rmw_axon::read(of.plans.response, of.label, response, ros_response);
-      // The identity of the request that it answers.
+      // The identity of the answered request.
       rmw_axon::copy_gid(of.gid, request_header->request_id.writer_guid);
       request_header->request_id.sequence_number =
       static_cast<int64_t>(response.info.publication_sequence);

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// What stands behind a context and a node.
+// The objects behind a context and a node.
 
 #ifndef CONTEXT_HPP_
 #define CONTEXT_HPP_
@@ -45,10 +45,10 @@ struct Node
   ~Node();
 };
 
-// A context that rmw_init made, and rmw_shutdown did not end yet.
+// Returns a context that rmw_init made and rmw_shutdown has not yet ended.
 rmw_context_impl_t & usable(rmw_context_t * context);
 
-// The node behind rmw's, judged as every function that is given one must.
+// Returns the node behind rmw's handle, after the checks that every function must make.
 Node & node_of(const rmw_node_t * node);
 
 }  // namespace rmw_axon

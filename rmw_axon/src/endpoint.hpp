@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// What stands behind publishers, subscriptions, servers and clients.
+// The objects behind publishers, subscriptions, servers and clients.
 
 #ifndef ENDPOINT_HPP_
 #define ENDPOINT_HPP_
@@ -24,19 +24,19 @@
 namespace rmw_axon
 {
 
-// One event of an endpoint: what an rmw_event_t's data points to. It lasts as long as its endpoint.
+// One event of an endpoint, to which the data of an rmw_event_t point. It lasts as long as its endpoint.
 struct EventSource
 {
   axon_event_t handle{};
 };
 
-// The events of an endpoint that were asked for.
+// The requested events of an endpoint.
 class EventSources
 {
 public:
   ~EventSources();
 
-  // The one of a kind, made by `make` when it is asked for first.
+  // Returns the event of a kind; `make` creates it at the first request.
   template<typename Make>
   EventSource & of(rmw_event_type_t kind, Make make)
   {
@@ -65,7 +65,7 @@ struct Publisher
   std::string topic;
   std::string label;
   EventSources events;
-  // Messages that are lent, by where they lie.
+  // Lent messages, by their address.
   std::mutex loans_mutex;
   std::unordered_map<void *, axon_loan_t> loans;
 
@@ -82,7 +82,7 @@ struct Subscription
   std::string topic;
   std::string label;
   EventSources events;
-  // Messages that are lent, by where they lie: a sample in place, or 0 where it is a copy.
+  // Lent messages, by their address: a sample in place, or 0 for a copy.
   std::mutex loans_mutex;
   std::unordered_map<void *, axon_sample_t> loans;
 
@@ -114,17 +114,17 @@ struct Client
   ~Client();
 };
 
-// How errors speak of an endpoint: topic /scan (node /robot/lidar)
+// Returns the name of an endpoint in error texts: topic /scan (node /robot/lidar)
 std::string label(const char * what, const char * name, const Node & node);
 
-// What is behind rmw's, judged as every function that is given one must.
+// Returns the object behind rmw's handle, after the checks that every function must make.
 Publisher & publisher_of(const rmw_publisher_t * publisher);
 Subscription & subscription_of(const rmw_subscription_t * subscription);
 Service & service_of(const rmw_service_t * service);
 Client & client_of(const rmw_client_t * client);
 
-// The parts of a new endpoint's options that are made in the same way for all. `names` keeps what the
-// options point to.
+// Names in a new endpoint's options, which all kinds of endpoints set in the same way. The options point to
+// them.
 struct EndpointNames
 {
   std::string name;
@@ -139,7 +139,7 @@ axon_endpoint_options_t endpoint_options(
   EndpointNames & names, const rmw_qos_profile_t & profile,
   const rosidl_service_type_support_t * type_support);
 
-// A message that was taken, where it lies, and what is known of it.
+// A taken message in place, and its information.
 class Taken
 {
 public:

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// What one asks of the graph about single endpoints: whose they are, their types and their QoS.
+// Queries of the graph about single endpoints: their nodes, their types and their QoS.
 
 #include <algorithm>
 #include <string>
@@ -71,7 +71,7 @@ rosidl_type_hash_t type_hash(const EndpointInfo & of)
 }
 #endif
 
-// What rmw has for topics, under names that it can have for services too.
+// The types and functions that rmw has for topics, under names that also fit services.
 struct OfTopic
 {
   using Info = rmw_topic_endpoint_info_t;
@@ -128,7 +128,7 @@ struct OfService
 };
 #endif
 
-// Fills rmw's array in, or leaves it as it was.
+// Fills rmw's array, or leaves it unchanged.
 template<typename Of>
 rmw_ret_t infos(
   const rmw_node_t * node, rcutils_allocator_t * allocator, const char * name,
@@ -144,7 +144,7 @@ rmw_ret_t infos(
       if (Of::check_zero(out) != RMW_RET_OK) {
         throw Failure(RMW_RET_INVALID_ARGUMENT, "the array of infos is not zero-initialised");
       }
-      // Nothing has a name that is none, for which rmw.h knows no error.
+      // No endpoint has an invalid name, and rmw.h specifies no error for it.
       std::vector<EndpointInfo> found;
       if (no_mangle || is_full_name(name)) {
         found = endpoints(of, kind, name);

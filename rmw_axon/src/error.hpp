@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// Errors inside are exceptions; at the border of each rmw function they become return codes and rmw's
-// error string, which says of what topic and node it speaks and why.
+// Internal errors are exceptions. At the border of each rmw function they become return codes and rmw's error
+// string. The string names the topic and node, and the reason.
 
 #ifndef ERROR_HPP_
 #define ERROR_HPP_
@@ -17,7 +17,7 @@
 namespace rmw_axon
 {
 
-// What rmw_get_implementation_identifier() gives, compared by address.
+// The result of rmw_get_implementation_identifier(), which is compared by address.
 extern const char * const identifier;
 
 class Failure : public std::runtime_error
@@ -29,10 +29,10 @@ public:
   const rmw_ret_t code;
 };
 
-// Throws what the core said of its last call in this thread, unless that call worked.
+// Throws the core's error of its last call in this thread, unless that call succeeded.
 void check(axon_ret_t returned);
 
-// An argument that may not be null, named as in rmw's headers.
+// Checks an argument that may not be null, named as in rmw's headers.
 template<typename Pointer>
 void require(Pointer pointer, const char * name)
 {
@@ -62,7 +62,7 @@ rmw_ret_t guarded(Body body) noexcept
     body();
     return RMW_RET_OK;
   } catch (const Failure & failure) {
-    // A timeout is an answer.
+    // A timeout is a result, not an error.
     if (failure.code != RMW_RET_TIMEOUT) {
       set_error(failure.what());
     }

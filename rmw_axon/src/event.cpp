@@ -18,7 +18,7 @@ namespace rmw_axon
 namespace
 {
 
-// AXON's number of a kind of event.
+// Returns AXON's number of a kind of event.
 std::optional<uint32_t> kind_of(rmw_event_type_t type)
 {
   switch (type) {
@@ -51,7 +51,7 @@ std::optional<uint32_t> kind_of(rmw_event_type_t type)
   }
 }
 
-// `make` asks the core for the endpoint's event of that kind.
+// Creates an event. `make` asks the core for the endpoint's event of that kind.
 template<typename Make>
 void init_event(
   rmw_event_t * event, EventSources & events, rmw_event_type_t type, const char * of, Make make)

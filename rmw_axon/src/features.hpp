@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// What the ROS distributions differ in, read off their headers: Humble (rmw 6.1), Iron (7.1), Jazzy (7.3),
-// Kilted (7.8), Lyrical and Rolling (7.10). Only cdr/buffer.hpp asks, too, of rosidl.
+// The differences between ROS distributions, detected from their headers: Humble (rmw 6.1), Iron (7.1), Jazzy
+// (7.3), Kilted (7.8), Lyrical and Rolling (7.10). Only cdr/buffer.hpp also detects a feature of rosidl.
 
 #ifndef FEATURES_HPP_
 #define FEATURES_HPP_
@@ -38,15 +38,15 @@
 #define AXON_RMW_LAST_EVENT RMW_EVENT_OFFERED_QOS_INCOMPATIBLE
 #endif
 
-// What rmw_destroy_wait_set and rmw_service_server_is_available return for a null argument. The headers of all
-// distributions say RMW_RET_INVALID_ARGUMENT; rmw's tests up to Jazzy want RMW_RET_ERROR.
+// The return code of rmw_destroy_wait_set and rmw_service_server_is_available for a null argument. The
+// headers of all distributions say RMW_RET_INVALID_ARGUMENT; rmw's tests up to Jazzy expect RMW_RET_ERROR.
 #if __has_include("rmw/enclave.h")
 #define AXON_RMW_NULL_ARGUMENT RMW_RET_INVALID_ARGUMENT
 #else
 #define AXON_RMW_NULL_ARGUMENT RMW_RET_ERROR
 #endif
 
-// After Kilted: the endpoints of a service, as those of a topic.
+// After Kilted: the endpoints of a service can be queried like those of a topic.
 #if __has_include("rmw/get_service_endpoint_info.h")
 #define AXON_RMW_SERVICE_ENDPOINT_INFO 1
 #else

@@ -13,7 +13,7 @@
 namespace rmw_axon
 {
 
-// AXON's sixteen bytes in a field of rmw's, which has more in Humble: the rest is zeros.
+// Copies AXON's sixteen bytes to a GID field of rmw. The field is longer in Humble; the rest is zeros.
 template<typename Byte, size_t size>
 void copy_gid(const axon_gid_t & from, Byte (& to)[size])
 {

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// What one asks of the graph: nodes, names with their types, counts.
+// Queries of the graph: nodes, names with their types, counts.
 
 #include <string>
 #include <tuple>
@@ -45,7 +45,7 @@ std::vector<NodeNames> nodes(const Node & node)
   return found;
 }
 
-// Of one node where its name is given, else of all.
+// Returns the names of one node, if its name is given, otherwise those of all nodes.
 std::vector<NameAndTypes> names(
   const Node & node, uint32_t kinds, const char * of_node, const char * of_namespace, bool all_names)
 {
@@ -94,7 +94,7 @@ char * duplicate(const std::string & text, rcutils_allocator_t allocator)
   return copy;
 }
 
-// Fills rmw's list in, or leaves it as it was.
+// Fills rmw's list, or leaves it unchanged.
 void give(
   const std::vector<NameAndTypes> & found, rcutils_allocator_t * allocator,
   rmw_names_and_types_t * out)
@@ -153,7 +153,7 @@ void require_zero(const rcutils_string_array_t * array, const char * name)
   }
 }
 
-// Node names as up to three lists, or none of them where memory is short.
+// Returns node names in up to three lists, or none of them if there is too little memory.
 rmw_ret_t node_names(
   const rmw_node_t * node, rcutils_string_array_t * names, rcutils_string_array_t * namespaces,
   rcutils_string_array_t * enclaves)

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// What all that ask the graph have in common.
+// Code that all queries of the graph share.
 
 #ifndef GRAPH_HPP_
 #define GRAPH_HPP_
@@ -18,8 +18,8 @@
 namespace rmw_axon
 {
 
-// What the core shows one by one. No exception may leave a visitor: the first is kept, and thrown when the
-// core has returned.
+// The items that the core passes to a visitor one by one. No exception may leave a visitor: the first one is
+// kept, and thrown when the core has returned.
 template<typename Item>
 struct Seen
 {

@@ -47,7 +47,7 @@ rmw_ret_t rmw_destroy_guard_condition(rmw_guard_condition_t * guard_condition)
     });
 }
 
-// A signal handler may call it: nothing here locks or allocates, but where an argument is wrong.
+// A signal handler may call it: nothing here locks or allocates, unless an argument is wrong.
 rmw_ret_t rmw_trigger_guard_condition(const rmw_guard_condition_t * guard_condition)
 {
   if (guard_condition != nullptr &&

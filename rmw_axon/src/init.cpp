@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// Init options, contexts, and the session that a context has.
+// Init options, contexts, and the session of a context.
 
 #include <dlfcn.h>
 
@@ -49,15 +49,15 @@ std::string installed_daemon()
   return (slash == std::string::npos ? "." : library.substr(0, slash)) + "/rmw_axon/axon_daemon";
 }
 
-// The session's options as the context's say it. `peers` keeps what they point to.
+// Sets the session's discovery options from the context's options. `peers` owns the array that they point to.
 void set_discovery(
   const rmw_init_options_t & options, axon_session_options_t & session,
   std::vector<const char *> & peers)
 {
-  // rcl has resolved ROS_*. Only who calls rmw without rcl leaves it to the library.
+  // rcl has resolved ROS_*. If a program calls rmw without rcl, the library resolves them.
 #if AXON_RMW_LOCALHOST_ONLY
   if (options.localhost_only == RMW_LOCALHOST_ONLY_ENABLED) {
-    // Wins over all that follows.
+    // This setting overrides all that follow.
     session.discovery = AXON_DISCOVERY_LOCALHOST;
     return;
   }
@@ -263,7 +263,7 @@ rmw_ret_t rmw_shutdown(rmw_context_t * context)
       require_initialized(context->implementation_identifier, "context");
       require(context->impl, "context's implementation");
       context->impl->is_shutdown = true;
-      // Where there was no node.
+      // This opens the log if the context never had a node.
       rmw_axon::tell_logger();
     });
 }
@@ -278,7 +278,7 @@ rmw_ret_t rmw_context_fini(rmw_context_t * context)
       if (!context->impl->is_shutdown) {
         throw Failure(RMW_RET_INVALID_ARGUMENT, "context is not shut down");
       }
-      // One of a forked child was its parent's to close.
+      // The result is ignored: the session of a forked child belongs to its parent, which closes it.
       axon_session_close(context->impl->session);
       delete context->impl;
       const rmw_ret_t ended = rmw_init_options_fini(&context->options);

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// Messages that a publisher lends, to be written in the memory that its subscriptions read: a stream's
-// header, and behind it the message itself, whose memory is the stream's body.
+// Messages that a publisher lends. The program writes them in the memory that the publisher's subscriptions
+// read. The memory contains a stream's header and then the message itself, which is the stream's body.
 
 #include <string>
 
@@ -17,7 +17,7 @@ namespace rmw_axon
 
 Publisher::~Publisher()
 {
-  // What is lent to the program still ends with the publisher: rmw has it returned before.
+  // Loans that the program still has end with the publisher: rmw requires the program to return them before.
   for (const auto & [message, loan] : loans) {
     plan.fini(message);
     axon_session_loan_abandon(loan);
@@ -37,7 +37,7 @@ void require_plain(const Publisher & publisher)
   }
 }
 
-// Takes a loan off the list of those that the program has.
+// Removes a loan from the list of the program's loans.
 axon_loan_t take_off(Publisher & publisher, void * message)
 {
   const std::lock_guard<std::mutex> lock(publisher.loans_mutex);

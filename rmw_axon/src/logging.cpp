@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// What the core says, as lines of ROS's logger `rmw_axon`.
+// Passes the core's log lines to ROS's logger `rmw_axon`.
 
 #include "logging.hpp"
 
@@ -28,13 +28,14 @@ void log_warning(const std::string & text)
   RCUTILS_LOG_WARN_NAMED(identifier, "%s", text.c_str());
 }
 
-// Where the core's thread waits with the first line until the logger may be told.
+// The core's thread waits here with its first line until the logger may be used.
 class Gate
 {
 public:
   void pass()
   {
-    // With release in open(): what the opener set before, the logger's levels above all.
+    // Pairs with the release in open(): this thread then sees everything that the opener set before, above
+    // all the logger's levels.
     if (is_open_.load(std::memory_order_acquire)) {
       return;
     }
@@ -102,9 +103,9 @@ void tell(const void *, uint32_t severity, const char * part, const char * text)
 void start_logging()
 {
   gate();
-  // The logger's level, which may change at any time, says what is told.
+  // The logger's level, which may change at any time, filters the lines.
   check(axon_session_log_set_severity(AXON_LOG_DEBUG));
-  // Refused where the program has a subscriber of its own for the log of Rust code: it gets all.
+  // This fails if the program has its own subscriber for the log of Rust code, which then gets all lines.
   axon_session_log_set_callback(tell, nullptr);
 }
 

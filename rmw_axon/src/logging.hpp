@@ -8,13 +8,13 @@
 namespace rmw_axon
 {
 
-// From now on what the core says in this process is for ROS's logger. As often as one likes.
+// Passes the core's log of this process to ROS's logger from now on. May be called repeatedly.
 void start_logging();
 
-// Tells the logger from now on, and first what has been said so far: a program sets its levels after rmw_init.
+// Opens the logger, and first passes it the lines so far: a program sets its levels after rmw_init.
 void tell_logger();
 
-// A warning of this adapter's own, told when the logger may be.
+// Logs a warning of this adapter, as soon as the logger may be used.
 void warn(std::string text);
 
 }  // namespace rmw_axon

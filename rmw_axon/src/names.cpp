@@ -26,7 +26,7 @@ std::string full_name(const char * name, const char * what)
   return name;
 }
 
-// The name of one that is no ROS name: without the slash in front.
+// Returns AXON's name for a topic that is not a ROS name: without the leading slash.
 std::string bare(const char * name, const char * what)
 {
   const std::string without = name[0] == '/' ? name + 1 : name;

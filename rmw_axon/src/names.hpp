@@ -2,10 +2,9 @@
 
 // Names of topics and services between ROS and AXON.
 //
-// AXON carries a ROS name as it is: /robot/scan is /robot/scan, for `axon echo` too. A topic that was
-// created with avoid_ros_namespace_conventions has its name without the slash in front, so that it meets
-// those of programs that are no ROS nodes, and never a ROS topic. Services are endpoints of their own
-// kind and need no prefix.
+// AXON uses a ROS name unchanged: /robot/scan is /robot/scan, also for `axon echo`. The name of a topic that
+// was created with avoid_ros_namespace_conventions loses its leading slash. So it matches topics of programs
+// that are not ROS nodes, and never a ROS topic. Services are endpoints of their own kind and need no prefix.
 
 #ifndef NAMES_HPP_
 #define NAMES_HPP_
@@ -15,10 +14,11 @@
 namespace rmw_axon
 {
 
-// AXON's name of a topic. Throws Failure where it is no full ROS name, unless the conventions are avoided.
+// Returns AXON's name of a topic. Throws Failure if the name is not a full ROS name, unless the conventions
+// are avoided.
 std::string topic_name(const char * name, bool avoid_ros_namespace_conventions);
 
-// AXON's name of a service.
+// Returns AXON's name of a service.
 std::string service_name(const char * name, bool avoid_ros_namespace_conventions);
 
 }  // namespace rmw_axon

@@ -91,7 +91,7 @@ rmw_publisher_t * rmw_create_publisher(
       names.type = publisher->plan.type;
       auto options = rmw_axon::endpoint_options(names, *qos_profile, type_support);
       if (publisher->plan.plain) {
-        // What is lent is in place from smaller sizes on where it is expected.
+        // For messages of the expected length, loans are in place from a smaller size on.
         const size_t size = rmw_axon::cdr::HEADER + publisher->plan.size_of;
         options.expected_len = static_cast<uint32_t>(std::min<size_t>(size, UINT32_MAX));
       }

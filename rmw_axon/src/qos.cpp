@@ -122,7 +122,7 @@ uint32_t liveliness(rmw_qos_liveliness_policy_t policy)
       return AXON_CHOICE_BEST_AVAILABLE;
 #endif
     default:
-      // MANUAL_BY_NODE among them, which ROS took back.
+      // One of these is MANUAL_BY_NODE, which ROS removed.
       unknown("liveliness", policy);
   }
 }
@@ -172,7 +172,7 @@ rmw_qos_policy_kind_t policy_kind(uint32_t policy)
       return RMW_QOS_POLICY_DURABILITY;
     case AXON_POLICY_DEADLINE:
       return RMW_QOS_POLICY_DEADLINE;
-    // To DDS, and so to ROS, they are one policy.
+    // DDS, and so ROS, treats them as one policy.
     case AXON_POLICY_LIVELINESS:
     case AXON_POLICY_LIVELINESS_LEASE:
       return RMW_QOS_POLICY_LIVELINESS;

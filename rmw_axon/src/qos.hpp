@@ -10,16 +10,17 @@
 namespace rmw_axon
 {
 
-// A profile as AXON takes it. Throws Failure where a policy is unknown or AXON has none like it.
+// Converts a profile to AXON's. Throws Failure if a policy is unknown or AXON has no equivalent.
 axon_qos_t to_core(const rmw_qos_profile_t & profile);
 
-// What AXON says that an endpoint has.
+// Converts the QoS that AXON reports for an endpoint.
 rmw_qos_profile_t from_core(const axon_qos_t & qos);
 
-// AXON_POLICY_*, as rmw's events name it.
+// Converts AXON_POLICY_* to rmw's policy kind.
 rmw_qos_policy_kind_t policy_kind(uint32_t policy);
 
-// Nanoseconds for AXON_*_wait and timeouts: null is for ever, and so is what is longer than 292 years.
+// Converts a timeout for AXON_*_wait to nanoseconds. Null means no timeout, as does a time of more than 292
+// years.
 int64_t timeout(const rmw_time_t * time);
 
 }  // namespace rmw_axon

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// ROS_SECURITY_*: AXON authenticates and encrypts by settings of its own. Of ROS's keystore it reads the permissions
-// of the enclave, as middlewares of DDS do where the enclave's files are there.
+// ROS_SECURITY_*: AXON authenticates and encrypts by its own settings. From ROS's keystore it reads only the
+// permissions of the enclave, as DDS middlewares do if the enclave's files exist.
 
 #include "security.hpp"
 
@@ -22,7 +22,7 @@ namespace rmw_axon
 namespace
 {
 
-// rcl leaves no trace of ROS_SECURITY_ENABLE in the options where it found no keystore and need not have one.
+// If rcl found no keystore and needs none, the options do not show ROS_SECURITY_ENABLE.
 bool is_enabled(const rmw_security_options_t & security)
 {
   const char * value = nullptr;
@@ -32,7 +32,7 @@ bool is_enabled(const rmw_security_options_t & security)
          security.enforce_security == RMW_SECURITY_ENFORCEMENT_ENFORCE;
 }
 
-// The enclave that rcl looked the folder up for.
+// Returns the enclave whose folder rcl looked up.
 std::string enclave_of(const rmw_init_options_t & options)
 {
   const char * value = nullptr;
@@ -41,7 +41,7 @@ std::string enclave_of(const rmw_init_options_t & options)
   return overridden ? value : options.enclave;
 }
 
-// Whether there is no such file. One that cannot be looked at may be there.
+// Returns whether the file is known to be missing. A file that cannot be examined may exist.
 bool is_missing(const std::string & path)
 {
   std::error_code error;
@@ -88,7 +88,7 @@ Enclave check_security(const rmw_init_options_t & options, const axon_session_op
   Enclave enclave;
   if (security.security_root_path != nullptr) {
     const std::string path = std::string(security.security_root_path) + "/permissions.p7s";
-    // Who is permissive has the session limited where the keystore has permissions for it.
+    // In permissive mode the permissions limit the session only if the keystore has them.
     if (enforced || !is_missing(path)) {
       enclave = {path, enclave_of(options)};
     }
@@ -99,7 +99,7 @@ Enclave check_security(const rmw_init_options_t & options, const axon_session_op
             "an enclave: set ROS_SECURITY_KEYSTORE");
   }
   static std::atomic<bool> warned{false};
-  // Relaxed: nothing else is read by it.
+  // Relaxed: the flag orders nothing else.
   if (warned.exchange(true, std::memory_order_relaxed)) {
     return enclave;
   }

@@ -11,16 +11,16 @@
 namespace rmw_axon
 {
 
-// The enclave whose permissions act for a session. Both are empty where none do.
+// The enclave whose permissions limit a session. Both fields are empty without permissions.
 struct Enclave
 {
   std::string permissions_path;
   std::string name;
 };
 
-// ROS's security settings beside AXON's. Throws Failure where ROS enforces security and AXON authenticates
-// nobody, or there is no folder of an enclave. Whether the permissions can be used, opening the session says.
-// Warns, once in a process, of what of ROS's settings has no effect.
+// Checks ROS's security settings against AXON's. Throws Failure if ROS enforces security and AXON
+// authenticates no peer, or if there is no folder of an enclave. Opening the session checks whether the
+// permissions are valid. Warns, once in a process, of ROS's settings without effect.
 Enclave check_security(const rmw_init_options_t & options, const axon_session_options_t & session);
 
 }  // namespace rmw_axon

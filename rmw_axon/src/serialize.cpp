@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// Messages to and from CDR for their own sake: rosbag2, generic publishers, tools.
+// Converts messages to and from CDR for programs that ask for it: rosbag2, generic publishers, tools.
 
 #include <string>
 

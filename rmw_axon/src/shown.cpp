@@ -35,12 +35,12 @@ bool steers(char32_t character)
 
 struct Character
 {
-  // 0 where the bytes are no UTF-8.
+  // 0 if the bytes are not UTF-8.
   char32_t value;
   size_t length;
 };
 
-// The character at `at`, or one byte that is no UTF-8.
+// Returns the character at `at`, or one byte that is not UTF-8.
 Character character_at(const std::string & text, size_t at)
 {
   const auto byte = [&](size_t i) {return static_cast<uint8_t>(text[i]);};

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// What ROS's tools are shown of names in the graph. Peers choose these names, AXON takes any text for one,
-// and the tools print them as they are: no name may steer a terminal, or be none in ROS.
+// Filters the names in the graph for ROS's tools. Peers choose these names, AXON accepts any text as a name,
+// and the tools print them unchanged. So no name may control a terminal, or be invalid in ROS.
 
 #ifndef SHOWN_HPP_
 #define SHOWN_HPP_
@@ -25,22 +25,22 @@ struct NameAndTypes
   std::vector<std::string> types;
 };
 
-// UTF-8 in which each character that could steer a terminal is replaced by a question mark: control
-// characters, line separators, marks that turn the direction of writing, and others without a shape. So is
-// each byte that is no UTF-8.
+// Returns UTF-8 in which a question mark replaces each character that could control a terminal: control
+// characters, line separators, marks that change the direction of writing, and others without a shape. It
+// also replaces each byte that is not UTF-8.
 std::string printable(const std::string & text);
 
-// Whether there is no such character in it.
+// Returns whether the text has no such character.
 bool is_printable(const std::string & text);
 
-// Whether it is a name of a topic or a service in ROS.
+// Returns whether it is a valid name of a topic or a service in ROS.
 bool is_full_name(const std::string & name);
 
-// Leaves out names that are none in ROS, or, if `all_names`, those that are not printable; of the rest the
-// types that are not printable, and names without any type.
+// Removes names that are invalid in ROS, or, if `all_names`, names that are not printable. Of the remaining
+// names removes the types that are not printable, and then names without any type.
 void leave_out_strange(std::vector<NameAndTypes> & names, bool all_names);
 
-// Leaves out nodes whose name or namespace is none in ROS. Their enclaves are made printable.
+// Removes nodes whose name or namespace is invalid in ROS. Their enclaves are made printable.
 void leave_out_strange(std::vector<NodeNames> & nodes);
 
 }  // namespace rmw_axon

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// Messages between the program's memory and the core's.
+// Copies messages between the program's memory and the core's.
 
 #ifndef STREAM_HPP_
 #define STREAM_HPP_
@@ -14,11 +14,11 @@
 namespace rmw_axon
 {
 
-// A message serialized: on the stack where it is small.
+// A serialized message; a small one is on the stack.
 class Stream
 {
 public:
-  // Throws Failure with `whose` in front where its type does not allow the message.
+  // Serializes a message. Throws Failure, with `whose` in front, if the message violates its type.
   Stream(const cdr::Plan & plan, const std::string & whose, const void * message);
 
   const uint8_t * data() const {return large_ ? large_.get() : small_;}
@@ -30,7 +30,7 @@ private:
   size_t size_;
 };
 
-// Reads what was taken into an initialised message. Throws Failure with `whose` in front.
+// Reads the taken bytes into an initialised message. Throws Failure with `whose` in front.
 void read(
   const cdr::Plan & plan, const std::string & whose, const Taken & taken, void * message);
 

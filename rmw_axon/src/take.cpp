@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// Everything that takes messages from a subscription: deserialized straight from where they lie,
-// serialized, several at once, and lent.
+// The functions that take messages from a subscription: deserialized in place, serialized, several at once,
+// and lent.
 
 #include "take.hpp"
 
@@ -42,7 +42,7 @@ void take(const Subscription & subscription, Taken & taken)
       subscription.handle, &taken.sample, &taken.data, &taken.size, &taken.info));
 }
 
-// False where there was none.
+// Takes a message. Returns false if there was none.
 bool take_message(Subscription & subscription, void * message, rmw_message_info_t * info)
 {
   Taken taken;
@@ -79,7 +79,7 @@ void take_serialized(
   *taken_any = true;
 }
 
-// A message of the heap with what was taken: where it cannot be looked at in place.
+// Returns the taken message as a copy on the heap, if it cannot be read in place.
 void * copied(const Subscription & subscription, const Taken & taken)
 {
   const cdr::Plan & plan = subscription.plan;

@@ -8,7 +8,7 @@
 namespace rmw_axon
 {
 
-// Gives back what a subscription lent: a sample, or a message of the heap.
+// Returns a loan of a subscription: a sample, or a message on the heap.
 void end_loan(const Subscription & subscription, void * message, axon_sample_t sample);
 
 }  // namespace rmw_axon

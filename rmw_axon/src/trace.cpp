@@ -5,8 +5,9 @@
 #include <chrono>
 #include <cstring>
 
-// The tracepoints of the distribution's tracetools, as tracetools.cmake found: it is there and records, rmw_publish has a
-// timestamp, there are tracepoints of clients and services.
+// The tracepoints of the distribution's tracetools, as tracetools.cmake found them: whether tracetools exists
+// and records, whether rmw_publish has a timestamp, and whether there are tracepoints of clients and
+// services.
 #ifndef AXON_TRACE
 #define AXON_TRACE 0
 #endif
@@ -41,7 +42,7 @@ struct Gid
 #endif
 
 #if AXON_TRACE_TIMESTAMP || AXON_TRACE_SERVICES
-// The clock of AXON_TIME_NOW.
+// Returns the time of the clock that AXON_TIME_NOW uses.
 int64_t now()
 {
   const auto since_epoch = std::chrono::system_clock::now().time_since_epoch();

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// The tracepoints of ros2_tracing, as the distribution's tracetools declares them. Without tracetools, and for
-// a tracepoint that it does not declare, each function here does nothing. A tracepoint that no session records
-// costs one look at its state.
+// The tracepoints of ros2_tracing, as the distribution's tracetools declares them. Without tracetools, and
+// for a tracepoint that it does not declare, each function here does nothing. A tracepoint that no session
+// records costs one check of its state.
 
 #ifndef TRACE_HPP_
 #define TRACE_HPP_
@@ -25,13 +25,14 @@ int64_t publish(const Publisher & publisher, const void * message);
 
 void send_request(const Client & client, const void * request, int64_t sequence);
 
-// As `publish`, for the response to request `sequence` of `client`.
+// Records `publish` for the response to request `sequence` of `client`.
 int64_t send_response(
   const Service & service, const void * response, const axon_gid_t & client, int64_t sequence);
 
-// Records a take when it ends, with or without an error: declared before the first step that can fail. `taken` outlives
-// it. The event has the source timestamp of what was taken, or 0. It says that a message was taken only after
-// `delivered`, so a message that cannot be read is an event with a timestamp and without a message.
+// Records a take when it ends, with or without an error. The caller declares it before the first step that
+// can fail. `taken` outlives it. The event has the source timestamp of the taken message, or 0. It has the
+// message only after `delivered`. So a message that cannot be read gives an event with a timestamp and
+// without a message.
 template<typename Endpoint>
 class Take
 {
@@ -43,7 +44,7 @@ public:
   Take & operator=(const Take &) = delete;
 
   void delivered() {delivered_ = true;}
-  // With the place of a message that was lent.
+  // Records the delivery, with the place of a lent message.
   void delivered(const void * message)
   {
     message_ = message;

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// What AXON does not have, said by the API: preallocation, content filters, network flow endpoints,
-// messages of types that are known at run time only.
+// Features that AXON does not have, and that the API reports as unsupported: preallocation, content filters,
+// network flow endpoints, and messages of types that are known only at run time.
 
 #include <string>
 

@@ -18,7 +18,7 @@ namespace rmw_axon
 namespace
 {
 
-// The handles of a wait, kept from one to the next so that waiting allocates nothing.
+// The handles of a wait. They are kept for the next wait, so that waiting allocates nothing.
 struct WaitSet
 {
   rmw_wait_set_t rmw{};
@@ -30,7 +30,7 @@ struct WaitSet
   std::vector<axon_event_t> events;
 };
 
-// The handles of an array of rmw's, whose null entries stay 0.
+// Copies the handles of an array of rmw's. Null entries stay 0.
 template<typename Object, typename Handle>
 void gather(void * const * entries, size_t count, std::vector<Handle> & handles)
 {
@@ -58,7 +58,7 @@ void clear(void ** entries, size_t count)
   std::fill_n(entries, count, nullptr);
 }
 
-// rmw's arrays, each of which may be missing.
+// The arrays of rmw, each of which may be missing.
 struct Entries
 {
   void ** at = nullptr;
@@ -134,7 +134,7 @@ rmw_ret_t rmw_wait(
       rmw_axon::gather<rmw_axon::GuardCondition>(of_guards.at, of_guards.count, set.guards);
       rmw_axon::gather<rmw_axon::Service>(of_services.at, of_services.count, set.servers);
       rmw_axon::gather<rmw_axon::Client>(of_clients.at, of_clients.count, set.clients);
-      // Of events rmw hands over the rmw_event_t itself, not its data.
+      // For events rmw passes the rmw_event_t itself, not its data.
       set.events.assign(of_events.count, axon_event_t{});
       for (size_t i = 0; i < of_events.count; ++i) {
         if (of_events.at[i] != nullptr) {
@@ -157,8 +157,8 @@ rmw_ret_t rmw_wait(
       const axon_ret_t waited =
       axon_session_wait(set.context->impl->session, &wait, rmw_axon::timeout(wait_timeout));
       if (waited == AXON_RET_TIMEOUT) {
-        // rclcpp's multi-threaded executor looks again and again, with no timeout, while a timer is due whose
-        // group is busy: the thread that is to make it free may have lost its processor to this one.
+        // rclcpp's multi-threaded executor polls without a timeout while the group of a due timer is busy.
+        // This thread may then take the processor from the thread that would free the group.
         if (wait_timeout != nullptr && wait_timeout->sec == 0 && wait_timeout->nsec == 0) {
           std::this_thread::yield();
         }

@@ -130,8 +130,8 @@ made::CType image_in_c()
   return type;
 }
 
-// Has the sequence hold a Buffer: not owned and with the size 0, as rclpy does, or owned, as a typesupport
-// that reads one does.
+// Makes the sequence hold a Buffer: not owned and with size 0, as rclpy does, or owned, as a typesupport that
+// reads a Buffer does.
 void hold(Sequence & sequence, Buffer * buffer, bool owned)
 {
   rosidl_runtime_c__uint8__Sequence__fini(&sequence);
@@ -146,7 +146,7 @@ Bytes many(size_t count, uint8_t value)
   return Bytes(count, value);
 }
 
-// The stream of an Image, written by the rules of CDR.
+// Returns the stream of an Image, written by the rules of CDR.
 Bytes stream_of(uint32_t width, const Bytes & data, const Bytes & last)
 {
   Bytes stream = {0, 1, 0, 0};
@@ -237,7 +237,7 @@ TEST(Buffers, buffer_that_a_sequence_in_c_holds_is_written_and_is_not_written_to
     hold(image.data, owned ? new Buffer(here) : &here, owned);
     hold(image.last, owned ? new Buffer(elsewhere) : &elsewhere, owned);
     EXPECT_EQ(made::encoded(plan, message.get()), stream);
-    // As long as what is there already.
+    // The new content has the same length as the current one.
     const Bytes other = stream_of(0, many(8, 1), many(300, 2));
     cdr::decode(plan, other.data(), other.size(), message.get());
     EXPECT_FALSE(image.data.is_rosidl_buffer || image.last.is_rosidl_buffer);

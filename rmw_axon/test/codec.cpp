@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// The codec against the streams of another implementation (Fast-CDR behind rosidl's generated code), in C
-// and in C++, and against streams that nobody should send.
+// Tests the codec against the streams of another implementation (Fast-CDR behind rosidl's generated code), in
+// C and in C++, and against invalid streams.
 
 #include <gtest/gtest.h>
 
@@ -100,8 +100,8 @@ private:
   std::unique_ptr<uint64_t[]> memory_;
 };
 
-// The byte orders that Fast-CDR writes. Fast-CDR 1 swaps the bytes of its own pointer where it should swap those of an
-// array's items: what it writes in the other order cannot be read.
+// Returns the byte orders in which Fast-CDR writes valid streams. Fast-CDR 1 swaps the bytes of its own
+// pointer where it should swap those of an array's items: its streams in the other order cannot be read.
 std::vector<Cdr::Endianness> orders()
 {
 #if AXON_FAST_CDR_2
@@ -155,7 +155,7 @@ TEST(Codec, writes_fast_cdr_bytes_and_reads_both_byte_orders)
           Message read;
           cdr::decode(plan, from.data(), from.size(), &read);
           EXPECT_EQ(read, *message) << plan.type;
-          // Into a message that holds something already.
+          // The message already holds values.
           for (const auto & before : type.messages) {
             Message used = *before;
             cdr::decode(plan, from.data(), from.size(), &used);
@@ -277,7 +277,7 @@ TEST(Codec, a_bool_is_true_or_false)
   std::memcpy(&memory, &message.bool_value, 1);
   EXPECT_EQ(memory, 1);
 
-  // What a program left there before it set any value.
+  // The byte stands for memory that the program has not set.
   memory = 0x7f;
   std::memcpy(static_cast<void *>(&message.bool_value), &memory, 1);
   stream = ours(plan, &message);
@@ -309,7 +309,7 @@ TEST(Codec, a_plain_message_is_read_where_it_lies)
     test_msgs::msg::BasicTypes read;
     std::memcpy(static_cast<void *>(&read), stream.data() + cdr::HEADER, sizeof(read));
     EXPECT_EQ(read, *message);
-    // Neither a short one, nor one whose bool is none, nor one in the other byte order.
+    // A short stream, one with an invalid bool, and one in the other byte order are not readable in place.
     EXPECT_FALSE(cdr::readable_in_place(plan, stream.data(), stream.size() - 1));
     stream[cdr::HEADER] = 2;
     EXPECT_FALSE(cdr::readable_in_place(plan, stream.data(), stream.size()));

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// Sequences whose container is neither a std::vector nor C's data, size and capacity. rosidl 5.1.4 made one
-// of uint8[]; the containers here are of no distribution, so that the test runs on all of them.
+// Tests sequences whose container is neither a std::vector nor C's data, size and capacity. rosidl 5.1.4 made
+// uint8[] one of these. The containers here belong to no distribution, so that the test runs on all of them.
 
 #include <gtest/gtest.h>
 
@@ -22,7 +22,7 @@ namespace
 
 using made::Bytes;
 
-// As large as a std::vector, in another order.
+// A container as large as a std::vector, with its fields in another order.
 template<typename Item>
 class Counted
 {
@@ -228,7 +228,7 @@ void round_trips()
     fill(*written, count);
     const Bytes stream = made::encoded(plan, written.get());
     EXPECT_EQ(stream, of_vectors(count));
-    // Into a message that has nothing, less, or more.
+    // The message holds no items, fewer, or more.
     for (const size_t before : {0, 1, 900}) {
       auto read = std::make_unique<Message>();
       fill(*read, before);
@@ -291,7 +291,7 @@ TEST(Containers, streams_cut_anywhere_and_in_the_other_byte_order_are_judged_ali
   const Bytes whole = of_vectors(5);
   for (size_t size = 0; size < whole.size(); ++size) {
     for (const bool little : {false, true}) {
-      // On the heap, so that a read beyond the end is seen.
+      // The stream is on the heap, so that AddressSanitizer detects a read beyond its end.
       const std::unique_ptr<uint8_t[]> cut(new uint8_t[size + 2]);
       std::memcpy(cut.get(), whole.data(), size);
       cut[1] = size > 1 && little;

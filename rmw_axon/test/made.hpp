@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// Introspection written by hand: types that no generator makes, with the fields that every distribution
-// has. What a distribution adds is zero.
+// Hand-written introspection: types that no generator makes, with the fields that every distribution has.
+// Fields that only some distributions have are zero.
 
 #ifndef MADE_HPP_
 #define MADE_HPP_
@@ -40,7 +40,7 @@ constexpr uint8_t WSTRING = rosidl_typesupport_introspection_c__ROS_TYPE_WSTRING
 constexpr uint8_t MESSAGE = rosidl_typesupport_introspection_c__ROS_TYPE_MESSAGE;
 }  // namespace id
 
-// The type's own introspection, whichever was asked for.
+// Returns the type's own introspection, whichever was requested.
 inline const rosidl_message_type_support_t * itself(
   const rosidl_message_type_support_t * handle, const char * identifier)
 {
@@ -122,7 +122,8 @@ public:
     all_->handle.typesupport_identifier = rosidl_typesupport_introspection_cpp::typesupport_identifier;
   }
 
-  // A sequence, with the functions that rosidl generates for one. None points into a std::vector<bool>.
+  // Adds a sequence, with the functions that rosidl generates for one. A std::vector<bool> has none that
+  // return a pointer.
   template<typename Sequence>
   CppMember & sequence(const char * name, uint8_t type_id, size_t offset)
   {

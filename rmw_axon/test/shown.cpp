@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// Names that a peer may choose, and what ROS's tools get to see of them.
+// Tests the names that a peer may choose, and their form in ROS's tools.
 
 #include "shown.hpp"
 
@@ -82,7 +82,7 @@ TEST(Shown, NodesThatAreNoneInRosAreLeftOut)
 
 TEST(Shown, NothingThatSteersATerminalIsPrintable)
 {
-  // The same as axon-transport/src/text.rs has.
+  // The list is that of axon-transport/src/text.rs.
   for (const char * text : {
         "\x01", "\x1b", "\r", "\n", "\t", "\x7f", "\xC2\x85", "\xC2\x9B", "\xC2\xAD", "\xD8\x9C",
         "\xE2\x80\x8B", "\xE2\x80\x8E", "\xE2\x80\x8F", "\xE2\x80\xA8", "\xE2\x80\xA9", "\xE2\x80\xAA",
@@ -96,7 +96,7 @@ TEST(Shown, NothingThatSteersATerminalIsPrintable)
 
 TEST(Shown, BytesThatAreNoUtf8AreNotPrintable)
 {
-  // C1 as one byte, a cut character, longer forms of ESC, a surrogate, what is beyond Unicode.
+  // C1 as one byte, a cut character, overlong forms of ESC, a surrogate, and a value beyond Unicode.
   EXPECT_EQ(rmw_axon::printable("\x9b""31m"), "?31m");
   EXPECT_EQ(rmw_axon::printable("\xC3"), "?");
   EXPECT_EQ(rmw_axon::printable("\xC0\x9B"), "??");

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// The tracepoints of each way to publish, take and call.
+// Tests the tracepoints of each way to publish, take and call.
 
 #include <gtest/gtest.h>
 
@@ -37,7 +37,7 @@ std::array<uint8_t, 16> gid_of(const Bytes & bytes)
 using test_msgs::msg::BasicTypes;
 using test_msgs::msg::UnboundedSequences;
 
-// Whether rmw_publish has the source timestamp and its publisher.
+// Whether rmw_publish records the source timestamp and its publisher.
 constexpr bool has_timestamp = AXON_TRACE_TIMESTAMP != 0;
 
 class Trace : public testing::Test
@@ -45,7 +45,7 @@ class Trace : public testing::Test
 protected:
   void SetUp() override
   {
-    // All within this process: the session of a context needs no daemon.
+    // Everything is within this process: the session of a context needs no daemon.
     setenv("AXON_DAEMON", "off", 1);
     recording = true;
     ASSERT_EQ(RMW_RET_OK, rmw_init_options_init(&options, rcutils_get_default_allocator()));
@@ -104,7 +104,7 @@ public:
     EXPECT_EQ(RMW_RET_OK, rmw_destroy_publisher(node_, publisher));
   }
 
-  // The only publication that is recorded, and what is common to all of them.
+  // Returns the only recorded publication, after the checks that all publications share.
   Event published(const void * message)
   {
     const auto found = named("rmw_publish");
@@ -120,7 +120,7 @@ public:
     return found[0];
   }
 
-  // That the only recorded take is of `published`.
+  // Checks that the only recorded take is of `published`.
   void taken(const Event & published, const void * message, int64_t source_timestamp)
   {
     const auto found = named("rmw_take");
@@ -134,7 +134,7 @@ public:
     }
   }
 
-  // As `taken`, by a way to take that tells the caller no source timestamp.
+  // Checks `taken` for a way to take that does not return the source timestamp.
   void taken(const Event & published, const void * message)
   {
     const auto found = named("rmw_take");
@@ -292,7 +292,7 @@ TEST_F(Trace, each_message_of_a_sequence_joins_its_publish)
   const auto published = named("rmw_publish");
   const auto takes = named("rmw_take");
   ASSERT_EQ(3u, published.size());
-  // The fourth found nothing.
+  // The fourth take found no message.
   ASSERT_EQ(4u, takes.size());
   EXPECT_FALSE(takes[3].taken);
   EXPECT_EQ(0, takes[3].timestamp);

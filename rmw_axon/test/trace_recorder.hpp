@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// Records the tracepoints that the library reaches, and their arguments. trace_recorder.cpp has the functions of tracetools,
-// which stand in front of those of its library, so no tracer is needed.
+// Records the tracepoints that the library reaches, and their arguments. trace_recorder.cpp defines the
+// functions of tracetools, which take precedence over those of its library, so no tracer is needed.
 
 #ifndef TRACE_RECORDER_HPP_
 #define TRACE_RECORDER_HPP_
@@ -22,7 +22,7 @@ struct Event
   std::array<uint8_t, 16> gid{};
 };
 
-// False if tracepoints are to say that no session records them.
+// False if tracepoints should report that no session records them.
 extern bool recording;
 // The events since the last clear, in order.
 extern std::vector<Event> events;

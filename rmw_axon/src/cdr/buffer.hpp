@@ -21,7 +21,7 @@
 namespace rmw_axon::cdr::buffer
 {
 
-// Whether `Member` says of a field that it is a Buffer: `is_rosidl_buffer_`.
+// Whether `Member` can mark a field as a Buffer: `is_rosidl_buffer_`.
 template<typename Member, typename = void>
 struct Flagged : std::false_type {};
 template<typename Member>
@@ -43,7 +43,8 @@ struct MayHold : std::false_type {};
 template<typename Sequence>
 struct MayHold<Sequence, std::void_t<decltype(Sequence::is_rosidl_buffer)>>: std::true_type {};
 
-// The Buffer that a sequence of numbers in C holds, or null. All such sequences have one layout.
+// Returns the Buffer that a sequence of numbers in C holds, or null. All sequences of numbers have one
+// layout.
 template<typename Sequence = rosidl_runtime_c__uint8__Sequence>
 const void * held_in_c(const void * sequence)
 {
@@ -59,8 +60,8 @@ const void * held_in_c(const void * sequence)
 
 size_t size(const void * buffer);
 
-// Copies `size` bytes, which is what the Buffer had when it was asked, from wherever they are.
-// Returns false if it has another number of them now.
+// Copies `size` bytes, the size that the Buffer reported, from wherever they are. Returns false if the Buffer
+// has another size now.
 bool copy_to(const void * buffer, uint8_t * into, size_t size);
 
 // Makes it a Buffer in this process's memory with these bytes.

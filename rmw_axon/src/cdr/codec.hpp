@@ -4,9 +4,9 @@
 // CORBA 3.3 part 2, clause 9.3) behind its encapsulation header of four bytes. Written in the machine's
 // byte order, read in either.
 //
-// A stream comes from anywhere and may change while it is read (it may lie in memory that its sender
-// writes to): every length is read once and judged before it is used, no byte outside the stream is
-// touched, and nothing is allocated for items that the rest of the stream could not hold.
+// A stream is not trusted and may change while it is read, because its sender may write to its memory. So
+// every length is read once and checked before it is used, no byte outside the stream is touched, and nothing
+// is allocated for items that the rest of the stream could not hold.
 
 #ifndef CDR__CODEC_HPP_
 #define CDR__CODEC_HPP_
@@ -22,22 +22,22 @@ namespace rmw_axon::cdr
 // Bytes before the body. The body is aligned within itself, from 0.
 inline constexpr size_t HEADER = 4;
 
-// How many bytes `encode` writes. Throws Error for a message that its type does not allow.
+// Returns how many bytes `encode` writes. Throws Error for a message that its type does not allow.
 size_t encoded_size(const Plan & plan, const void * message);
 
 // Writes the stream of `message`, at most `capacity` bytes, and returns how many.
 // Throws Error where the type does not allow the message, or it does not fit.
 size_t encode(const Plan & plan, const void * message, uint8_t * out, size_t capacity);
 
-// Reads a stream into an initialised message. Throws Error where it is no stream of the type; the
-// message is then initialised still, with what was read so far. Bytes after the message are ignored.
+// Reads a stream into an initialised message. Throws Error if it is not a stream of the type; the message
+// then stays initialised, with the part that was read. Bytes after the message are ignored.
 void decode(const Plan & plan, const uint8_t * stream, size_t size, void * message);
 
-// The encapsulation header of a stream in this machine's byte order.
+// Writes the encapsulation header of a stream in this machine's byte order.
 void write_header(uint8_t * out);
 
-// Of a plain type: whether a stream's body may be looked at as a message where it lies, being in this
-// machine's byte order, long enough and without a bool that is neither true nor false.
+// For a plain type: returns whether a stream's body can be read as a message in place. It must be in this
+// machine's byte order, long enough, and without a bool that is neither true nor false.
 bool readable_in_place(const Plan & plan, const uint8_t * stream, size_t size);
 
 }  // namespace rmw_axon::cdr

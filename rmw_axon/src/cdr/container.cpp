@@ -66,7 +66,7 @@ void resize(const Field & field, void * sequence, size_t size)
   }
 }
 
-// Whether the sequence's memory is that of a container whose items are adjacent, being at these addresses.
+// Returns whether the sequence's memory is that of a container with adjacent items at these addresses.
 bool is_contiguous(const Field & field, uint8_t * sequence, size_t size)
 {
   if (field.size(sequence) != size) {
@@ -107,7 +107,7 @@ bool looks_contiguous(const Members & members, const Member & member, const Fiel
   }
   Sample<Members> sample(members);
   uint8_t * sequence = sample.at(member.offset_);
-  // Twice, so that no number that happens to be there passes for a size or an address.
+  // The check runs for two sizes, so that no number in memory passes by chance for a size or an address.
   for (const size_t size : {size_t{1}, std::min<size_t>(field.count, 5)}) {
     resize(field, sequence, size);
     if (!is_contiguous(field, sequence, size)) {

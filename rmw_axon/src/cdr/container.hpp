@@ -14,8 +14,8 @@
 namespace rmw_axon::cdr
 {
 
-// `field` is what `member` of `members` is, with the introspection's functions. Throws Error where these
-// do not suffice to reach the items.
+// Returns how to reach the items of `member` of `members`; `field` is its field with the introspection's
+// functions. Throws Error if these functions do not suffice.
 Container container_of(
   const rosidl_typesupport_introspection_c__MessageMembers & members,
   const rosidl_typesupport_introspection_c__MessageMember & member, const Field & field);
@@ -23,7 +23,7 @@ Container container_of(
   const rosidl_typesupport_introspection_cpp::MessageMembers & members,
   const rosidl_typesupport_introspection_cpp::MessageMember & member, const Field & field);
 
-// Bytes from the member's start to the next member, or to the message's end.
+// Returns the bytes from the member's start to the next member, or to the message's end.
 size_t room_of(
   const rosidl_typesupport_introspection_c__MessageMembers & members,
   const rosidl_typesupport_introspection_c__MessageMember & member);

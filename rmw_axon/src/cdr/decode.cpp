@@ -14,7 +14,7 @@ namespace rmw_axon::cdr
 namespace
 {
 
-// The compiler may not go back to the stream for what is in `value`: the second look could differ.
+// Keeps the compiler from reading `value` from the stream again: the second read could differ.
 template<typename Number>
 Number once(Number value)
 {
@@ -22,7 +22,7 @@ Number once(Number value)
   return value;
 }
 
-// Kept out of the way of streams that are whole.
+// Kept out of line, because valid streams never reach it.
 [[noreturn, gnu::cold, gnu::noinline]] void fail(const Field & field, const char * what)
 {
   throw Error(std::string(field.name) + ": " + what);
@@ -49,7 +49,7 @@ public:
   Reader(const uint8_t * body, size_t size, bool swapped)
   : body_(body), size_(size), swapped_(swapped) {}
 
-  // The next `size` bytes, aligned.
+  // Returns the next `size` bytes, aligned.
   const uint8_t * bytes(size_t size, size_t alignment, const Field & field)
   {
     align(alignment, field);
@@ -79,7 +79,7 @@ public:
     return swapped_ ? __builtin_bswap32(value) : value;
   }
 
-  // The length of a sequence or a string, of items that have at least `least` bytes each.
+  // Reads the length of a sequence or a string, of items that have at least `least` bytes each.
   size_t length(size_t most, size_t least, const Field & field)
   {
     const size_t length = word(field);
@@ -102,7 +102,7 @@ private:
   size_t position_ = 0;
 };
 
-// Any byte but 0 is true, so that no other one gets into a bool.
+// Any byte except 0 is true, so that no other value gets into a bool.
 uint8_t flag(const uint8_t * at)
 {
   return once(*at) != 0;
@@ -120,7 +120,7 @@ char16_t wide_character(Reader & reader, const Field & field)
 template<typename In>
 void get_string(const Field & field, void * into, Reader & reader)
 {
-  // With the byte 0 at its end; some write an empty one without.
+  // The length includes the terminating byte 0; some writers omit it in an empty string.
   const size_t most = field.characters == SIZE_MAX ? SIZE_MAX : field.characters + 1;
   const size_t length = reader.length(most, 1, field);
   if (length == 0) {
@@ -143,8 +143,8 @@ void get_wide_string(const Field & field, void * into, Reader & reader)
   }
 }
 
-// Whether messages that lie one after another are read by one copy. Bytes between their fields are
-// nobody's, in memory and in the stream.
+// Returns whether adjacent messages are read by one copy. The bytes between their fields have no meaning, in
+// memory and in the stream.
 bool as_in_memory(const Plan & plan)
 {
   return plan.plain && !plan.has_bool && *plan.fixed == plan.size_of;
@@ -153,7 +153,7 @@ bool as_in_memory(const Plan & plan)
 template<typename In>
 void get_message(const Plan & plan, uint8_t * message, Reader & reader);
 
-// `count` items that lie one after another in memory.
+// Reads `count` items that are adjacent in memory.
 template<typename In>
 void get_items(const Field & field, uint8_t * into, size_t count, Reader & reader)
 {
@@ -218,7 +218,7 @@ size_t least_of_item(const Field & field)
   }
 }
 
-// `size` items, each given to the introspection's functions.
+// Reads `size` items, and passes each to the introspection's functions.
 template<typename In>
 void get_each(const Field & field, uint8_t * sequence, size_t size, Reader & reader)
 {
@@ -290,7 +290,7 @@ void get_message(const Plan & plan, uint8_t * message, Reader & reader)
   }
 }
 
-// Whether the stream is in the other byte order. Throws where it is no plain CDR at all.
+// Returns whether the stream is in the other byte order. Throws if it is not plain CDR.
 bool other_order(const uint8_t * stream, size_t size)
 {
   if (size < HEADER) {

@@ -80,7 +80,7 @@ public:
 private:
   uint8_t * room(size_t size)
   {
-    // A message that another thread makes longer while it is published.
+    // Another thread made the message longer while it was published.
     if (size > capacity_ - position_) {
       changed();
     }
@@ -122,15 +122,15 @@ void put_long_doubles(Sink & sink, const uint8_t * from, size_t count, const Fie
 {
   sink.align(field.alignment);
   for (size_t i = 0; i < count; ++i) {
-    // x87's has ten bytes of value and six that are whatever was there.
+    // A long double of the x87 has ten bytes of value and six undefined bytes.
     constexpr size_t value = LDBL_MANT_DIG == 64 ? 10 : sizeof(long double);
     sink.copy(from + i * field.stride, value);
     sink.zeros(field.width - value);
   }
 }
 
-// Whether messages that lie one after another are written by one copy: no byte is between their fields,
-// where something of the program's might be that is nobody's business.
+// Returns whether adjacent messages are written by one copy: there is no byte between their fields, where
+// other data of the program could leak.
 bool dense(const Plan & plan)
 {
   return plan.plain && plan.fields.front().run_bytes == plan.size_of;
@@ -139,7 +139,7 @@ bool dense(const Plan & plan)
 template<typename In, typename Sink>
 void put_message(const Plan & plan, const uint8_t * message, Sink & sink);
 
-// `count` items that lie one after another.
+// Writes `count` adjacent items.
 template<typename In, typename Sink>
 void put_items(const Field & field, const uint8_t * from, size_t count, Sink & sink)
 {
@@ -149,7 +149,7 @@ void put_items(const Field & field, const uint8_t * from, size_t count, Sink & s
       sink.copy(from, count * field.width);
       return;
     case Item::Bool:
-      // A C program that did not set one leaves any byte there, and it is true.
+      // A C program that did not set the bool leaves any byte there; every byte except 0 is true.
       for (size_t i = 0; i < count; ++i) {
         put(sink, static_cast<uint8_t>(from[i] != 0));
       }
@@ -194,7 +194,8 @@ void put_items(const Field & field, const uint8_t * from, size_t count, Sink & s
   }
 }
 
-// `size` items that the introspection's functions give one by one. A std::vector<bool> has no item to point to.
+// Writes `size` items, which the introspection's functions return one by one. A std::vector<bool> has no item
+// to point to.
 template<typename In, typename Sink>
 void put_each(const Field & field, const uint8_t * sequence, size_t size, Sink & sink)
 {

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// What C's messages and C++'s do differently: strings and sequences.
+// The differences between messages of C and C++: strings and sequences.
 
 #ifndef CDR__ITEMS_HPP_
 #define CDR__ITEMS_HPP_
@@ -93,10 +93,10 @@ struct InC
     }
   }
 
-  // The Buffer that holds the sequence's items in place of the sequence, or null.
+  // Returns the Buffer that holds the sequence's items in place of the sequence, or null.
   static const void * buffer(const Field & field, const void * sequence)
   {
-    // Of primitive types alone, which have a width.
+    // A Buffer holds only primitive types, which have a width.
     if (field.width == 0 || field.container != Container::Contiguous) {
       return nullptr;
     }
@@ -107,7 +107,7 @@ struct InC
     return held;
   }
 
-  // Has the sequence hold its items itself. A Buffer that it held is ended as its flags say.
+  // Makes the sequence hold its items itself. A Buffer that it held is released as its flags say.
   static void release_buffer(const Field & field, void * sequence)
   {
     if (buffer(field, sequence) != nullptr) {
@@ -182,8 +182,8 @@ struct InCpp
     static_cast<std::vector<Number> *>(sequence)->assign(numbers, numbers + size);
   }
 
-  // An image of megabytes is not zeroed first, where the sequence is a vector and the stream is aligned.
-  // Container::Contiguous alone.
+  // Sets the items. If the sequence is a vector and the stream is aligned, a large image is not zeroed first.
+  // For Container::Contiguous only.
   static void set_numbers(const Field & field, void * sequence, const uint8_t * from, size_t size)
   {
     if (!field.bounded && reinterpret_cast<uintptr_t>(from) % field.alignment == 0) {

@@ -99,7 +99,8 @@ size_t least_of(const Field & field)
   return item * field.count;
 }
 
-// Joins neighbours that one copy can carry. Only numbers: every byte of one is a value.
+// Joins neighbouring fields that one copy can carry. They must be numbers, of which every byte is part of a
+// value.
 void find_runs(std::vector<Field> & fields)
 {
   for (size_t i = fields.size(); i-- > 0; ) {
@@ -121,8 +122,8 @@ void find_runs(std::vector<Field> & fields)
   }
 }
 
-// Where the body ends that starts at `position`, for fields without strings and sequences; and whether
-// every item lies where it lies in memory.
+// Returns the end of the body that starts at `position`, for fields without strings and sequences. Also
+// determines whether every item has the same position in memory.
 size_t lay_out(const Plan & plan, size_t position, size_t memory, bool & as_in_memory, bool & has_bool)
 {
   for (const Field & field : plan.fields) {
@@ -135,7 +136,7 @@ size_t lay_out(const Plan & plan, size_t position, size_t memory, bool & as_in_m
     }
     position = (position + field.alignment - 1) / field.alignment * field.alignment;
     as_in_memory &= position == memory + field.offset && field.stride == field.width;
-    // Neither is read back as it is written.
+    // Neither is read back in the form in which it is written.
     as_in_memory &= field.item != Item::LongDouble && field.item != Item::WChar;
     has_bool |= field.item == Item::Bool;
     position += field.width * field.count;
@@ -170,7 +171,8 @@ void set_functions(const Member & member, Field & field)
   }
 }
 
-// A distribution may store a type in another way than those that are known: seen where it takes less memory.
+// A distribution may store a type in an unknown way. This detects a type that takes less memory than
+// expected.
 template<typename Members, typename Member>
 void require_room(const Members & members, const Member & member, size_t size)
 {
@@ -182,7 +184,7 @@ void require_room(const Members & members, const Member & member, size_t size)
   }
 }
 
-// Appends what the member is in a message at `base`. A single nested message is its fields.
+// Appends the fields of the member in a message at `base`. A single nested message is replaced by its fields.
 template<typename Members, typename Member>
 void append(const Members & members, const Member & member, size_t base, std::vector<Field> & fields)
 {
@@ -258,7 +260,7 @@ Plan build(const Members & members)
   return plan;
 }
 
-// The handle that `find` gives for the first of the two languages that has one.
+// Returns the handle that `find` gives for the first of the two languages that has one.
 template<typename Handle>
 const Handle * introspection(const Handle * handle, Language & language)
 {

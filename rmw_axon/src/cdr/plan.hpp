@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: MIT OR Apache-2.0
 
-// How a message lies in memory and how it lies in a CDR stream, worked out once per type from its
-// introspection, in C and in C++. Encoding and decoding walk a plan; no generated code takes part.
+// The layout of a message in memory and in a CDR stream. It is computed once per type from the type's
+// introspection, in C and in C++. Encoding and decoding follow a plan; they use no generated code.
 
 #ifndef CDR__PLAN_HPP_
 #define CDR__PLAN_HPP_
@@ -22,7 +22,7 @@
 namespace rmw_axon::cdr
 {
 
-// What is wrong with a message or a stream: said with the field's name.
+// A defect of a message or a stream; the text has the field's name.
 class Error : public std::runtime_error
 {
 public:
@@ -31,7 +31,7 @@ public:
 
 enum class Language { C, Cpp };
 
-// What a field holds, once or many times.
+// The kind of a field's items.
 enum class Item { Number, Bool, LongDouble, WChar, String, WString, Message };
 
 enum class Shape { One, Array, Sequence };
@@ -39,9 +39,9 @@ enum class Shape { One, Array, Sequence };
 // How a sequence stores its items.
 enum class Container
 {
-  // Unknown: each item is reached through the introspection's functions.
+  // The layout is unknown: each item is reached through the introspection's functions.
   Opaque,
-  // One after another: a std::vector in C++; data, size and capacity in C.
+  // The items are adjacent: a std::vector in C++; data, size and capacity in C.
   Contiguous,
   // C++: a rosidl::Buffer<uint8_t>.
   Buffer,
@@ -54,7 +54,7 @@ struct Field
   const char * name = "";
   Item item = Item::Number;
   Shape shape = Shape::One;
-  // The introspection's type_id_, which tells a vector of floats from one of integers.
+  // The introspection's type_id_, which distinguishes a vector of floats from one of integers.
   uint8_t type_id = 0;
   // Bytes of an item in the stream, and their alignment there. 0 for strings and messages.
   size_t width = 0;
@@ -62,15 +62,15 @@ struct Field
   // Bytes from the start of the message, and from one item to the next.
   size_t offset = 0;
   size_t stride = 0;
-  // Array: how many items. Sequence: at most so many.
+  // Array: the number of items. Sequence: their maximum number.
   size_t count = 1;
-  // Strings: at most so many characters.
+  // Strings: the maximum number of characters.
   size_t characters = SIZE_MAX;
   // Item::Message
   std::unique_ptr<Plan> message;
   // Shape::Sequence
   Container container = Container::Opaque;
-  // As introspection gives them.
+  // The functions of the introspection.
   size_t (* size)(const void *) = nullptr;
   const void * (*at)(const void *, size_t) = nullptr;
   void * (*at_mutable)(void *, size_t) = nullptr;
@@ -81,8 +81,9 @@ struct Field
   // An unbounded sequence in C++ is a std::vector; a bounded one is a class of its own.
   bool bounded = false;
 
-  // This and the fields after it that lie without a gap in memory and, where the stream's position
-  // agrees with the offset modulo `run_alignment`, in the stream too: one copy for all of them.
+  // The run of this field and the following ones without a gap between them in memory. They have no gap in
+  // the stream either if its position equals the offset modulo `run_alignment`. One copy carries the whole
+  // run.
   size_t run_fields = 1;
   size_t run_bytes = 0;
   size_t run_alignment = 1;
@@ -91,29 +92,29 @@ struct Field
 struct Plan
 {
   Language language = Language::Cpp;
-  // As `ros2 interface show` takes it: std_msgs/msg/String
+  // The name, as `ros2 interface show` accepts it: std_msgs/msg/String
   std::string type;
   size_t size_of = 0;
-  // Of a plain type: where a message may lie.
+  // For a plain type: the alignment of a message in memory.
   size_t alignment = 1;
   std::vector<Field> fields;
-  // The fewest bytes that one can have in a stream. At least 1.
+  // Minimum number of bytes of a message in a stream, at least 1.
   size_t least = 0;
-  // Bytes of the body where all messages of the type have as many: no string, no sequence.
+  // Number of bytes of the body, if all messages of the type have the same number: no string, no sequence.
   std::optional<size_t> fixed;
-  // The memory is the body, byte for byte but for padding.
+  // True if the memory equals the body, byte for byte except for padding.
   bool plain = false;
-  // Plain, and with a byte that is not any value's: a bool.
+  // True if the type is plain and has a bool, for which not every byte is a valid value.
   bool has_bool = false;
 
-  // What every new message is made by, zeroed or with its defaults, and ended by.
+  // The functions that make every new message, zeroed or with its defaults, and that end it.
   void init(void * message) const;
   void (* init_c)(void *, rosidl_runtime_c__message_initialization) = nullptr;
   void (* init_cpp)(void *, rosidl_runtime_cpp::MessageInitialization) = nullptr;
   void (* fini)(void *) = nullptr;
 };
 
-// Throws Error where no introspection comes with the type, in C or in C++.
+// Computes the plan of a type. Throws Error if the type has no introspection, in C or in C++.
 Plan plan(const rosidl_message_type_support_t * type_support);
 
 struct ServicePlans
