@@ -27,8 +27,8 @@ pub use session::{
     daemon_check_access_at, daemon_reload_at, daemon_status, daemon_status_at,
 };
 
-/// What the other crates of AXON and its tests use of this one. It is not part of its interface, and changes
-/// with any release.
+/// The items of this crate that the other crates of AXON and its tests use. They are not part of its interface, and
+/// change with any release.
 #[doc(hidden)]
 pub mod internal {
     pub use crate::session_key::{OWNER, SessionKey, session_id};
@@ -44,7 +44,7 @@ pub mod internal {
     pub mod config {
         pub use crate::config::rules_file::parse as parse_rules_file;
     }
-    /// What `include/axon.h` declares, for crates that make libraries of it.
+    /// The functions that `include/axon.h` declares, for crates that build libraries from them.
     pub mod ffi {
         pub use crate::ffi::*;
     }
@@ -83,7 +83,7 @@ pub mod internal {
     pub mod sros2 {
         pub use crate::sros2::expression::Expression;
 
-        /// What a file of permissions says.
+        /// The content of a permissions file.
         pub mod document {
             pub use crate::sros2::document::*;
         }

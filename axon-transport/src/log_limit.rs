@@ -7,7 +7,7 @@ use std::{
 
 const BETWEEN: Duration = Duration::from_secs(1);
 
-/// Counts what would be said of each.
+/// Counts the events of one log line.
 #[derive(Debug, Default)]
 pub struct LogLimit(Mutex<LogCount>);
 
@@ -18,8 +18,8 @@ struct LogCount {
 }
 
 impl LogLimit {
-    /// Counts one more at `now`, a time since any start that stays the same. Returns how many there were since the last
-    /// line, this one among them, if a line is due.
+    /// Counts one more event at `now`, a time since any fixed start. If a line is due, returns the number of events
+    /// since the last line, including this one.
     pub fn count(&self, now: Duration) -> Option<u64> {
         let mut said = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         said.since += 1;

@@ -14,7 +14,7 @@ use crate::{ids::SessionId, secrets::LockedKey};
 
 /// The type of the packet in which a session hands its key to its daemon, before HELLO.
 pub const OWNER: u8 = 32;
-/// What stands in front of the key there: the type, and a map of one entry, a string of 32 bytes.
+/// The bytes before the key in the packet: the type, and a map of one entry, a string of 32 bytes.
 const PACKET: [u8; 5] = [OWNER, 0xa1, 0x00, 0x58, 0x20];
 
 /// Bytes of stack, more than Ed25519 takes: its scalar and nonce are left there. Without optimization, code in
@@ -83,14 +83,14 @@ impl SessionKey {
     }
 }
 
-/// Never inlined, so that all it leaves is on the stack below the caller, who erases that.
+/// Never inlined, so that all its data is on the stack below the caller, who erases that stack.
 #[inline(never)]
 fn public_of(seed: &LockedKey) -> [u8; 32] {
     SigningKey::from_bytes(seed.expose_secret()).verifying_key().to_bytes()
 }
 
-/// As [`public_of`]. The library's key is made for each signature, since it is in memory that is not
-/// locked.
+/// Signs a message; never inlined, like [`public_of`]. The library's key is made for each signature, since its memory
+/// is not locked.
 #[inline(never)]
 fn sign(seed: &LockedKey, message: &[u8]) -> [u8; 64] {
     SigningKey::from_bytes(seed.expose_secret()).sign(message).to_bytes()

@@ -392,7 +392,7 @@ impl PeerDecision {
 mod tests {
     use super::*;
 
-    /// The names, order and units of what `axon status --json` prints are read by programs.
+    /// Programs read the names, order and units in the output of `axon status --json`.
     #[test]
     fn the_json_of_a_status_is_as_programs_know_it() {
         let reader = concat!(
@@ -440,7 +440,7 @@ mod tests {
         assert_eq!((&json["rtt_us"], &json["waiting_ms"]), (&1.into(), &u64::MAX.into()));
     }
 
-    /// An earlier daemon says nothing of what it does not know.
+    /// An earlier daemon omits fields that it does not know.
     #[test]
     fn missing_status_fields_have_their_default() {
         let reader = r#"{"pid":41,"reader":"aa","writer":"bb","relay":false,"depth":null,"unread":0,

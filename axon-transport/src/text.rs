@@ -1,9 +1,9 @@
 //! Makes text from outside safe for a log line or a terminal.
 
-/// Whether `c` is shown as itself. Control characters, line separators, marks that turn the
-/// direction of writing, and other characters without a shape of their own are not.
+/// Returns whether `c` is shown as itself. Control characters, line separators, marks that change the direction of
+/// writing, and other characters without a shape of their own are not.
 pub fn is_plain(c: char) -> bool {
-    // The standard library keeps the table of what is printable, and escapes quotes besides.
+    // The standard library has the table of printable characters, but also escapes quotes.
     matches!(c, '"' | '\'' | '\\') || c.escape_debug().len() == 1
 }
 

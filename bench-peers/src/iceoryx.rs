@@ -34,8 +34,8 @@ impl Medium for Iceoryx2 {
                 self.node.get_or_init(|| node)
             }
         };
-        // One pair of services, named by the process that measures, for all loads one after the
-        // other: those of the last are gone with its ends.
+        // The measuring process names one pair of services. All loads use it one after the other, because the services
+        // of the last load are gone with its ends.
         let id: u32 = match side {
             Side::Near => {
                 channel.tell(&process::id())?;
@@ -110,8 +110,8 @@ impl End for IceoryxEnd {
                     bytes[at].write(byte);
                     bytes[end + at].write(byte);
                 }
-                // SAFETY: the bytes between are those of memory that the system or an earlier
-                // sample has filled; what a message that is only touched has to say is in the ends.
+                // SAFETY: the system or an earlier sample has initialised the memory of the bytes in between. The ends
+                // contain everything that a merely touched message has to carry.
                 unsafe { sample.assume_init() }
             }
             Motion::Fill | Motion::Copy => {

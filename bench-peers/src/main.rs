@@ -32,7 +32,7 @@ use zenoh::Zenoh;
 /// follow each other at once, AXON looks for a while before it sleeps, and the others do not.
 const KINDS: [(Wake, Motion); 3] =
     [(Wake::Poll, Motion::Touch), (Wake::Poll, Motion::Copy), (Wake::EventOneCpu, Motion::Touch)];
-/// What messages at a pace are.
+/// The kinds of messages at a pace.
 const PACED: [Motion; 2] = [Motion::Touch, Motion::Copy];
 const PACE: Duration = Duration::from_millis(1);
 /// The kinds of streams.
@@ -59,7 +59,7 @@ struct Arguments {
 /// The media in their order.
 const MEDIA: [&str; 4] = ["raw", "AXON", "iceoryx2", "zenoh"];
 
-/// A load, and what each medium made of it.
+/// A load, and the results of each medium.
 struct Compared {
     load: Load,
     rounds: Vec<Rounds>,

@@ -10,12 +10,12 @@ use crate::{
     text::{self, TextTable},
 };
 
-/// How figures are taken from rounds; in every output.
+/// How the figures are computed from rounds; every output contains this text.
 const REPORTED: &str = "All take turns. Times are one way (half a round trip): p50 of the round in \
                         which it was least, p99 of all rounds together; at a pace both are of \
                         all rounds. Ratios are of these p50, to AXON's. CPU is the processor \
                         time of a message in both processes together.";
-/// Where AXON is among the media.
+/// The index of AXON among the media.
 const AXON: usize = 1;
 const VERSIONS: &str = "iceoryx2 0.10.0, zenoh 1.10.2";
 
@@ -114,7 +114,7 @@ fn table<'a>(rows: impl Iterator<Item = &'a Compared>, cell: Cell) -> String {
     table.render(0)
 }
 
-/// Of the round in which it was least, and of messages at a pace that of all rounds.
+/// Returns the p50 of the round in which it was least; for messages at a pace, the p50 of all rounds.
 fn p50(compared: &Compared, rounds: &Rounds) -> f64 {
     match compared.load.pace {
         None => rounds.best().p50(),
@@ -122,7 +122,7 @@ fn p50(compared: &Compared, rounds: &Rounds) -> f64 {
     }
 }
 
-/// How many times AXON's time the others took.
+/// Returns the other media's times as multiples of AXON's.
 fn ratios(compared: &Compared) -> impl Iterator<Item = f64> {
     let axon = p50(compared, &compared.rounds[AXON]);
     compared.rounds[AXON + 1..].iter().map(move |rounds| p50(compared, rounds) / axon)

@@ -1,4 +1,4 @@
-//! zenoh: peers over a unix socket, which carries what says where in shared memory a message is.
+//! zenoh: peers over a unix socket, which carries the positions of messages in shared memory.
 
 use std::{cell::OnceCell, env, process, thread, time::Duration};
 
@@ -16,7 +16,7 @@ use crate::harness::{self, Channel, End, Error, Load, Medium, Motion, Side, Wake
 
 /// Below this many bytes zenoh does not use shared memory by itself, and is faster without.
 const SHARED_FROM: usize = 3072;
-/// Messages for which there is memory beside those that are under way: freed memory is found when
+/// Number of additional messages for which there is memory, beside those in flight: zenoh finds freed memory only when
 /// there is no other.
 const SPARE: usize = 6;
 
@@ -79,7 +79,7 @@ impl Medium for Zenoh {
         let publisher = session
             .declare_publisher(key(out))
             .congestion_control(CongestionControl::Block)
-            // Nothing waits for more to go with it; a stream is better off in batches.
+            // A single message is sent at once, because it waits for no other one. A stream profits from batches.
             .express(!load.is_stream())
             .wait()
             .map_err(Error::from)?;

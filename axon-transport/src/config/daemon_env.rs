@@ -14,7 +14,7 @@ use super::{files::Files, names, sources::FOREIGN};
 pub(crate) struct DaemonEnv {
     /// True if the daemon also inherits the settings in the session's environment, as they are when it is started.
     pub(crate) inherits: bool,
-    /// Variables that have this value, or are unset, whatever the session's environment says.
+    /// Variables that have this value, or are unset, even if the session's environment differs.
     pub(crate) variables: BTreeMap<OsString, Option<OsString>>,
 }
 

@@ -17,7 +17,7 @@ use crate::access::{AccessError, AccessRules, HostPattern};
 
 /// The access rules of the host. A daemon uses them if its settings name no rules.
 const OF_HOST: &str = "/etc/axon/access.toml";
-/// The value of `AXON_ACCESS_FILE` for no rules, not even those of the host.
+/// The value of `AXON_ACCESS_FILE` for no rules, which disables those of the host as well.
 const NO_FILE: &str = "/dev/null";
 
 /// Parses the rules of a file. A file with a setting is parsed as an `axon.toml` with rules, as `AXON_CONFIG` may

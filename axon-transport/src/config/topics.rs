@@ -63,7 +63,7 @@ pub enum TopicPriority {
     /// The priority of topics without an entry.
     #[default]
     Normal,
-    /// Before all other topics, whatever the length of the samples.
+    /// Before all other topics, for any length of the samples.
     High,
 }
 

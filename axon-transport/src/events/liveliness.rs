@@ -142,8 +142,8 @@ mod tests {
     }
 
     proptest! {
-        /// The numbers that the changes add up to are those of publishers whose last assertion is
-        /// within their lease, and of the others.
+        /// The changes add up to the number of publishers whose last assertion is within their lease, and the number of
+        /// the others.
         #[test]
         fn the_changes_add_up(steps in prop::collection::vec(step(), 1..60)) {
             let mut liveness = Liveness::default();

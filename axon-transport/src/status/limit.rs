@@ -2,23 +2,23 @@
 
 use serde::{Deserialize, Serialize};
 
-/// A limit that this host sets on what crosses between it and a peer, and what it did. It counts for all links of the
-/// peer's identity.
+/// A limit that this host sets on the traffic with a peer, and its effect. It counts for all links of the peer's
+/// identity.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct LimitStatus {
-    /// What the peer does that is limited: `publish`, `subscribe` or `call`; or `egress`, all packets to it, or by the
-    /// network interface that the link uses.
+    /// The limited action of the peer: `publish`, `subscribe` or `call`. For a limit on all packets to the peer, or by
+    /// the network interface that the link uses: `egress`.
     pub verb: String,
-    /// The topic or service, or those that have the limit together, as `(/a, /b together)` or `(all topics)`; or
-    /// `(all packets)`, or `(all packets by wlan0)`.
+    /// The topic or service. Several topics or services that share the limit appear as `(/a, /b together)`, or as
+    /// `(all topics)`. For `egress` this is `(all packets)`, or `(all packets by wlan0)`.
     pub name: String,
     /// The limit.
     pub limit: String,
-    /// Where it is written.
+    /// The place of the rule in its file.
     pub place: String,
     /// Samples, requests or packets that passed.
     pub passed: u64,
-    /// Those that were dropped.
+    /// Number of dropped samples, requests or responses.
     pub dropped: u64,
 }

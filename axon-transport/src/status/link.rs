@@ -37,15 +37,15 @@ pub struct LinkStatus {
     pub host: String,
     /// The peer's SAE ID in qkd.
     pub sae: Option<String>,
-    /// Its address and port.
+    /// The peer's address and port.
     pub address: String,
-    /// `connected`, or what it waits for.
+    /// `connected`, or the event for which the link waits.
     pub state: String,
     /// The key exchange as negotiated, read from the handshake.
     pub key_exchange: String,
     /// The cipher suite as negotiated.
     pub cipher: String,
-    /// How and as whom the peer proved itself.
+    /// The method and the name with which the peer authenticated itself.
     pub authenticated_as: String,
     /// The peer as access rules name it; empty from a daemon of an earlier version.
     #[serde(default)]
@@ -68,14 +68,13 @@ pub struct LinkStatus {
     /// Packets that were lost.
     #[serde(default)]
     pub packets_lost: u64,
-    /// Bytes of these packets. QUIC retransmits what they carried and still matters: its own counter of that does not
-    /// exist.
+    /// Bytes of these packets. QUIC retransmits the parts that are still needed, and has no counter of them.
     #[serde(default)]
     pub bytes_lost: u64,
     /// Datagrams that arrived with an ECN mark: a router on the way here is congested.
     #[serde(default)]
     pub ecn_marks_in: u64,
-    /// Times that the peer reported new ECN marks on what was sent to it, since its address changed last.
+    /// Times that the peer reported new ECN marks on packets of this host, since the peer's address changed last.
     #[serde(default)]
     pub ecn_marks_out: u64,
     /// Times that the congestion controller took packets for lost, or marked.
@@ -90,10 +89,10 @@ pub struct LinkStatus {
     /// Bytes of samples that wait for the link.
     #[serde(default)]
     pub waiting_bytes: u64,
-    /// The same by class, and control messages.
+    /// The waiting bytes by class, and those of control messages.
     #[serde(default)]
     pub waiting: WaitingStatus,
-    /// How long the oldest of them has waited; milliseconds in JSON.
+    /// Waiting time of the oldest waiting sample; milliseconds in JSON.
     #[serde(default, rename = "waiting_ms", with = "times::millis")]
     pub oldest_waits: Duration,
     /// The second link to the peer, which stands by over another path.
@@ -101,7 +100,7 @@ pub struct LinkStatus {
     pub standby: Option<StandbyStatus>,
     /// Samples received.
     pub samples_in: u64,
-    /// Of the samples received, those that came over the second path first.
+    /// Number of received samples whose copy over the second path came first.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub copies_in: u64,
     /// Samples sent.
@@ -118,25 +117,26 @@ pub struct LinkStatus {
     /// Topics and services that do not cross though they match, and why: the first 64.
     #[serde(default)]
     pub routes_refused: BTreeMap<String, String>,
-    /// How many more there are.
+    /// Number of further routes that are not listed.
     #[serde(default)]
     pub more_routes_refused: usize,
-    /// What access rules deny, here to the peer and there to this host: the first 64.
+    /// Uses that access rules deny, here to the peer and there to this host: the first 64.
     #[serde(default)]
     pub denied: BTreeMap<String, String>,
-    /// How many more there are.
+    /// Number of further denials that are not listed.
     #[serde(default)]
     pub more_denied: usize,
-    /// The limits in force between this host and the peer's identity: the first 64, those that dropped most first.
+    /// The limits in force between this host and the peer's identity: the first 64, in the order of their dropped
+    /// samples, most first.
     #[serde(default)]
     pub limits: Vec<LimitStatus>,
-    /// How many more there are.
+    /// Number of further limits that are not listed.
     #[serde(default)]
     pub more_limits: usize,
     /// Endpoints and nodes of the peer that are known here.
     #[serde(default)]
     pub endpoints: u64,
-    /// Those that it announces and that are left out here; a refusal names the first.
+    /// Number of endpoints that the peer announces and this host leaves out; a refusal names the first.
     #[serde(default)]
     pub endpoints_left_out: u64,
     /// Bytes that count for the graph of the peer's identity, over all of its daemon ids.
@@ -155,7 +155,7 @@ pub struct LinkStatus {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct CompressedStatus {
-    /// How many.
+    /// Number of samples.
     pub samples: u64,
     /// Their bytes, which [`bytes_out`](LinkStatus::bytes_out) counts.
     pub bytes: u64,
@@ -163,9 +163,10 @@ pub struct CompressedStatus {
     pub bytes_sent: u64,
 }
 
-/// Bytes that wait in the daemon until QUIC takes them, by class: a class goes before those below it, of
-/// which each that waits has about an eighth of what is sent. A flow counts as a whole for the class of its next sample. BEST_EFFORT and KEEP_ALL samples wait in their
-/// publisher's ring: those that the daemon has not taken from there do not count.
+/// Bytes that wait in the daemon until QUIC takes them, by class. A class goes before the classes below it. Each lower
+/// class that waits still gets about an eighth of the rate. A flow counts as a whole for the class of its next sample.
+/// BEST_EFFORT and KEEP_ALL samples wait in their publisher's ring: samples that the daemon has not taken from there do
+/// not count.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct WaitingStatus {

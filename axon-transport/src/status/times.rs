@@ -1,4 +1,4 @@
-//! How times stand in the JSON of a status: as whole numbers of a unit. Each module is for `#[serde(with = "…")]`.
+//! The form of times in the JSON of a status: whole numbers of a unit. Each module is for `#[serde(with = "…")]`.
 
 use std::time::{Duration, SystemTime};
 

@@ -368,7 +368,7 @@ fn rules_that_cannot_be_used_are_refused_with_their_place() {
     assert!(error.contains("a file in TOML; line 2, column 23: "), "{error}");
     let both = pinned(&[("AXON_CONFIG", "/f/axon.toml"), ("AXON_ACCESS_FILE", "/f/good.toml")]);
     assert!(both.unwrap_err().contains("rules in one place"));
-    // Where nobody proves a name, a rule for a name would protect nothing.
+    // If no peer proves a name, a rule for a name would protect nothing.
     let error = resolve(&[("AXON_ACCESS_FILE", "/f/good.toml")]).unwrap_err();
     assert!(error.contains("\"base\"") && error.contains("AXON_CLASSIC_AUTH=none"), "{error}");
     resolve(&[("AXON_ACCESS_FILE", "/f/address.toml")]).unwrap();
@@ -410,7 +410,7 @@ fn rules_of_the_host_apply_without_a_setting_and_fail_closed() {
         let error = refused(mode, text);
         assert!(error.contains("/etc/axon/access.toml") && error.contains(why), "{error}");
     }
-    // Nobody can say what is in it.
+    // The content of the file is unknown.
     let directory = Config::default().with_rules_of(Path::new("/f"), &Disk::new());
     assert!(directory.unwrap_err().to_string().contains("regular file"));
     let denied = Config::default().with_rules_of(of_host, &Unreadable).unwrap_err().to_string();
