@@ -255,7 +255,7 @@ fn mappings(pid: u32) -> io::Result<Vec<Mapping>> {
     Ok(mappings)
 }
 
-/// `7f0e-7f1e rw-p …`: a mapping's first line.
+/// Parses the first line of a mapping, such as `7f0e-7f1e rw-p …`.
 fn header(line: &str) -> Option<(usize, usize, &str)> {
     let (range, rest) = line.split_once(' ')?;
     let (start, end) = range.split_once('-')?;

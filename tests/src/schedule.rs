@@ -85,7 +85,7 @@ impl Hash {
         }
     }
 
-    /// HKDF-Expand-Label for at most one block.
+    /// Computes HKDF-Expand-Label for at most one block.
     fn expand(self, secret: &[u8], label: &str, context: &[u8], len: usize) -> Vec<u8> {
         let mut info = vec![0, len as u8, label.len() as u8 + 6];
         info.extend(b"tls13 ");
@@ -161,14 +161,14 @@ impl Schedule {
         schedule
     }
 
-    /// The traffic secrets of the handshake, the client's and the server's, from ClientHello and ServerHello.
+    /// Returns the traffic secrets of the handshake, the client's and the server's, from ClientHello and ServerHello.
     pub fn of_handshake(terms: Terms<'_>, hellos: &[u8], shared: Option<&[u8]>) -> [Vec<u8>; 2] {
         let mut schedule = Self::empty(terms.cipher);
         let handshake = schedule.until_handshake_secret(terms, shared);
         schedule.handshake_traffic_secrets(&handshake.expect("all inputs are known"), hellos)
     }
 
-    /// The key of QUIC's packets, its IV, and the key of their headers, from a traffic secret.
+    /// Returns the key of QUIC's packets, its IV, and the key of their headers, from a traffic secret.
     pub fn packet_keys(cipher: Cipher, secret: &[u8]) -> ([u8; 32], [u8; 12], [u8; 32]) {
         let expand = |label, len| Hash(cipher).expand(secret, label, b"", len);
         let [key, iv, header] = [("quic key", 32), ("quic iv", 12), ("quic hp", 32)]
@@ -181,7 +181,7 @@ impl Schedule {
         Self { hash: Hash(cipher), used_up: vec![], in_use: vec![], exporter: vec![] }
     }
 
-    /// `None` if the key exchange that comes into it is not known.
+    /// Returns the handshake secret. Returns `None` if it depends on a key exchange whose result is not known.
     fn until_handshake_secret(
         &mut self,
         terms: Terms<'_>,
@@ -248,12 +248,12 @@ impl Schedule {
         self.in_use.push(Secret::new(name, &secret));
     }
 
-    /// The secrets that an established connection has no use for.
+    /// Returns the secrets that an established connection has no use for.
     pub fn used_up(&self) -> &[Secret] {
         &self.used_up
     }
 
-    /// The secrets that an established connection still uses.
+    /// Returns the secrets that an established connection still uses.
     pub fn in_use(&self) -> &[Secret] {
         &self.in_use
     }
@@ -269,13 +269,14 @@ impl Schedule {
         Some([of_label, exported])
     }
 
-    /// Every secret.
+    /// Returns every secret.
     pub fn all(&self) -> Vec<Secret> {
         [self.used_up(), self.in_use()].concat()
     }
 }
 
-/// The transcript up to ServerHello, up to the server's Finished, and up to the client's; `None` before that has come.
+/// Returns the transcript up to ServerHello, up to the server's Finished, and up to the client's; `None` while it is
+/// incomplete.
 pub fn flights(transcript: &[u8]) -> Option<[&[u8]; 3]> {
     let mut ends = Vec::new();
     let mut at = 0;

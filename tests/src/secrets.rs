@@ -97,8 +97,8 @@ impl Needles {
     }
 }
 
-/// For each message of an envelopes' key, the block that masks its tag (NIST SP 800-38D, 7.1). It opens nothing, but with the
-/// key of GHASH it lets messages be forged.
+/// Returns, for each message of an envelope key, the block that masks its tag (NIST SP 800-38D, 7.1). The block
+/// decrypts nothing, but with it and the key of GHASH an attacker can forge messages.
 pub fn tag_masks(aead_key: &[u8; 32], nonce_prefix: [u8; 8]) -> [[u8; 16]; 10] {
     let cipher = Aes256::new(aead_key.into());
     std::array::from_fn(|index| {

@@ -52,12 +52,12 @@ impl Authority {
         Self { pem, issuer: Issuer::new(params, copy), key }
     }
 
-    /// A certificate with this common name, and these DNS names in its subjectAltName, if any.
+    /// Issues a certificate with this common name, and these DNS names in its subjectAltName, if any.
     fn issue(&self, name: &str, dns: &[&str]) -> Pair {
         issued(named(name, dns), &self.issuer)
     }
 
-    /// A CA below this one, whose own certificate is of version 1.
+    /// Creates a CA below this one, whose own certificate is of version 1.
     fn below_in_version_1(&self) -> Self {
         let mut params = named("CA below", &[]);
         params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
@@ -88,7 +88,7 @@ fn issued(params: CertificateParams, issuer: &Issuer<'static, KeyPair>) -> Pair 
     Pair { cert, key: key.serialize_pem() }
 }
 
-/// A certificate as version 1 (RFC 5280, 4.1), signed by `issuer`.
+/// Returns a certificate as version 1 (RFC 5280, 4.1), signed by `issuer`.
 fn version_1(pem: &str, issuer: &KeyPair) -> String {
     let der = CertificateDer::from_pem_slice(pem.as_bytes()).unwrap();
     let mut certificate = content(&der);
@@ -110,7 +110,7 @@ fn version_1(pem: &str, issuer: &KeyPair) -> String {
     format!("-----BEGIN CERTIFICATE-----\n{text}\n-----END CERTIFICATE-----\n")
 }
 
-/// The number of bytes before the content of a DER element, and of the content.
+/// Returns the number of bytes before the content of a DER element, and of the content.
 fn lengths(der: &[u8]) -> (usize, usize) {
     match der[1] {
         short @ 0..=0x7f => (2, usize::from(short)),
@@ -161,7 +161,7 @@ fn qkd(builder: ConfigBuilder) -> QkdConfig {
     }
 }
 
-/// The settings of sae-a, with its files in `dir`.
+/// Returns the settings of sae-a, with its files in `dir`.
 fn sae(dir: &Path, ca: &str, pair: &Pair, url: &str) -> ConfigBuilder {
     Config::builder()
         .security_mode(SecurityMode::Qkd)
@@ -179,7 +179,7 @@ async fn asked(config: &QkdConfig) -> Result<(), String> {
     kme.probe("sae-b").await.map(drop).map_err(|failure| failure.to_string())
 }
 
-/// A TLS server that presents the certificates of `pair`, usable or not, and serves no request.
+/// Starts a TLS server that presents the certificates of `pair`, usable or not, and serves no request.
 fn show(pair: &Pair) -> SocketAddr {
     let chain = CertificateDer::pem_slice_iter(pair.cert.as_bytes()).map(Result::unwrap).collect();
     let key = PrivateKeyDer::from_pem_slice(pair.key.as_bytes()).unwrap();
@@ -246,7 +246,7 @@ fn an_saes_certificate_of_version_1_is_refused_by_setting_and_file() {
     Kme::check(&qkd(sae(dir.path(), &roots, &client, "https://127.0.0.1:9"))).unwrap();
 }
 
-/// The settings of a host that shows `pair`.
+/// Returns the settings of a host that shows `pair`.
 fn host(dir: &Path, roots: &str, pair: &Pair) -> Config {
     let config = Config::builder()
         .classic_auth(ClassicAuth::Ca)

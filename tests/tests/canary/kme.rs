@@ -16,7 +16,7 @@ use rustls::{ServerConfig, ServerConnection, StreamOwned};
 
 use crate::kmes::{self, Kmes};
 
-/// The key of a number, as the script has it.
+/// Returns the key of a number in a script.
 pub(crate) fn key(number: u64) -> [u8; 32] {
     let mut state = number.wrapping_add(0x51_7c_c1_b7_27_22_0a_95);
     let mut key = [0; 32];
@@ -36,13 +36,13 @@ pub(crate) fn key_id(number: u64) -> String {
 }
 
 impl Kmes {
-    /// Settings for the KME with the script.
+    /// Returns settings for the KME with the script.
     pub(crate) fn scripted(&self) -> ClientBuilder {
         self.settings("sae-a", 2)
     }
 }
 
-/// In the child: serves until standard input ends. Elsewhere: nothing.
+/// In the child: serves until standard input ends. Elsewhere: does nothing.
 pub(crate) fn serve_if_asked() {
     kmes::serve_if_asked(1_000, |dir| Some(listen(dir)));
 }
@@ -120,7 +120,7 @@ fn answer(mut stream: Stream) -> std::io::Result<()> {
     }
 }
 
-/// Each call is a record of its own.
+/// Sends bytes: each call is a TLS record of its own.
 fn send(stream: &mut Stream, bytes: &[u8]) -> std::io::Result<()> {
     stream.write_all(bytes)?;
     stream.flush()

@@ -109,7 +109,7 @@ fn exposed(keys: &[Key]) -> Vec<Vec<u8>> {
 
 type Answer = Result<KeyContainer, Error>;
 
-/// A script, by `enc_keys` and by `dec_keys`, for one key and for many.
+/// Judges a script by `enc_keys` and by `dec_keys`, for one key and for many.
 fn judge_script(
     script: &str,
     settings: impl Fn(ClientBuilder) -> ClientBuilder,

@@ -13,7 +13,7 @@ use crate::{judge, quarantine};
 const DRAWN: u64 = 2000;
 const HELD: usize = 64;
 
-/// A pool with a script's KME, until it is dropped by `use_it`.
+/// Judges a pool with a script's KME. `use_it` uses the pool and drops it.
 fn judge_pool(
     name: &str,
     script: &str,

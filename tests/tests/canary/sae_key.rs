@@ -14,7 +14,7 @@ fn secret(der: &[u8]) -> usize {
     der.windows(5).position(|window| window == before).unwrap() + 5
 }
 
-/// The secret's bytes whose base64 text, in a PEM file of `der`, encodes no other byte.
+/// Returns the secret's bytes whose base64 text, in a PEM file of `der`, encodes no other byte.
 fn needle(der: &[u8]) -> Vec<u8> {
     let begin = secret(der).next_multiple_of(3);
     let end = (secret(der) + 32) / 3 * 3;

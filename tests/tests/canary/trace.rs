@@ -23,12 +23,12 @@ impl Trace {
         Self { frames }
     }
 
-    /// The functions, innermost first, without hashes.
+    /// Returns the functions, innermost first, without hashes.
     pub(crate) fn names(&self) -> Vec<String> {
         self.functions().into_iter().map(|function| function.name).collect()
     }
 
-    /// The innermost function that is no mere carrier.
+    /// Returns the innermost function that is not a mere carrier.
     pub(crate) fn site(&self) -> String {
         let functions = self.functions();
         let site = functions.iter().find(|f| !CARRIERS.contains(&f.krate.as_str()));

@@ -139,7 +139,8 @@ fn check<A: Aead>(seal: Seal<A>, open: Open<A>) {
     }
 }
 
-/// The first refusal on a thread is free with RustCrypto; aws-lc sets up the thread's error queue.
+/// Refuses one message. The first refusal on a thread allocates nothing with RustCrypto; aws-lc sets up the thread's
+/// error queue.
 fn refuse_once<A: Aead>() -> Allocations {
     let mut envelope = vec![0; sealer::<A>(0).overhead()];
     seal_into(&mut sealer::<A>(0), &[], &mut envelope);

@@ -80,7 +80,7 @@ impl Hosts {
         hosts
     }
 
-    /// In each way in which a peer proves its name, and in `none`, where its address counts.
+    /// Runs the test in each way in which a peer proves its name, and in `none`, where its address counts.
     fn in_all(test: impl Fn(Self)) {
         let keys = tempfile::tempdir().unwrap();
         test(Self::start(pinned(keys.path(), [[false, true], [true, false]]), "host-1", keys));

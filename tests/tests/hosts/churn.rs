@@ -76,7 +76,7 @@ impl Churn {
     }
 }
 
-/// The ages of samples from host B to host A, in order of age.
+/// Returns the sorted ages of samples from host B to host A.
 fn ages(publisher: &Publisher, subscription: &Subscription, taken: &AtomicU64) -> Vec<Duration> {
     let epoch = Instant::now();
     let mut ages = thread::scope(|scope| {

@@ -23,8 +23,8 @@ pub(crate) fn wired(settings: [Settings; 2]) -> ([Host; 2], Wire) {
     ([a, b], wire)
 }
 
-/// Samples flow through a wire that is cut for eight seconds. Then the link is in the pauses that QUIC
-/// makes, as a path shows them whose congestion window is full.
+/// Tests that samples flow again after a wire was cut for eight seconds. The link is then in one of QUIC's pauses, as
+/// on a path whose congestion window is full.
 fn flows_again(settings: [Settings; 2]) {
     let (hosts, wire) = wired(settings);
     let mut there = hosts[1].subscribe(Sizes::Mixed);

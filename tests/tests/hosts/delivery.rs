@@ -72,7 +72,7 @@ fn classic_with_pinned_keys() {
     }
 }
 
-/// In qkd, and how many keys SAEs got by asking for new ones and by key_ID.
+/// Delivers messages in qkd. Returns the number of keys that SAEs got as new ones, and by key_ID.
 fn deliver_qkd(more: &[(&'static str, &str)], key_exchange: &str, cipher: &str) -> (u64, u64) {
     let kmes = Kmes::start();
     let settings = [0, 1].map(|host| kmes.settings(host, more));

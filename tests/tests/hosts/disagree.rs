@@ -18,7 +18,7 @@ fn hosts(kmes: &Kmes) -> [Host; 2] {
     Plan::new([0, 1].map(|host| kmes.settings(host, &more))).start()
 }
 
-/// A counter of a host's keys towards the other SAE.
+/// Returns a counter of a host's keys towards the other SAE.
 fn counter(host: &Host, peer: &str, direction: &str, name: &str) -> u64 {
     host.status().keys["peers"][peer][direction][name].as_u64().unwrap_or_default()
 }

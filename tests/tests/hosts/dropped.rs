@@ -15,7 +15,7 @@ use super::{
 
 const TYPE: &str = "test/Bytes";
 
-/// A publisher on the first host and a subscription on the second that have met.
+/// Creates a publisher on the first host and a matched subscription on the second.
 fn across(hosts: &[Host; 2], topic: &str, qos: Qos) -> (Publisher, Subscription) {
     let (here, there) = (hosts[0].session("publisher"), hosts[1].session("subscription"));
     let spec = || EndpointSpec::new(topic, TYPE, qos);

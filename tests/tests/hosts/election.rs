@@ -64,7 +64,7 @@ impl Elector {
         self.stranger.hear(met, whole).expect("the host's graph");
     }
 
-    /// A link, and the one that takes over from it.
+    /// Creates a link, and another one that takes over from it.
     fn supersede(&self) -> (Met, Met) {
         let (mut first, mut last) = (self.meet(), self.meet());
         self.elect(&mut first, 1);

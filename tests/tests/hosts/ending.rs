@@ -19,7 +19,7 @@ fn spec() -> EndpointSpec {
     EndpointSpec::new(TOPIC, "test/Bytes", Qos::keep_all())
 }
 
-/// A publisher on the first host and a subscription on the second that have met.
+/// Creates a publisher on the first host and a matched subscription on the second.
 fn across(hosts: &[Host; 2]) -> (Publisher, Subscription) {
     let (here, there) = (hosts[0].session("publisher"), hosts[1].session("subscription"));
     let subscription = there.create_subscription(spec()).unwrap();
@@ -47,7 +47,7 @@ pub(crate) fn take(subscription: &Subscription, last: u64) -> Vec<u64> {
     numbers
 }
 
-/// Samples that the status counts as lost with this cause.
+/// Returns the number of samples that the status counts as lost with this cause.
 fn lost(host: &Host, cause: &str) -> u64 {
     let topics = host.status().topics;
     let topics = topics.iter().filter(|topic| topic.topic == TOPIC);

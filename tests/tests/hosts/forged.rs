@@ -49,7 +49,7 @@ enum Forged {
 }
 
 impl Forged {
-    /// The datagram of this number, as one that comes from `address` has it.
+    /// Returns the datagram of this number, as if it came from `address`.
     fn datagram(&self, domain: u32, number: u64, address: SocketAddr) -> Option<Datagram> {
         let mut id = [if number.is_multiple_of(2) { 0x11 } else { 0xee }; 16];
         id[1..9].copy_from_slice(&number.to_be_bytes());
@@ -142,7 +142,7 @@ fn linked(hosts: &[Host; 2]) -> bool {
     has(&a, &b) && has(&b, &a)
 }
 
-/// Processor time that the host's daemon has taken.
+/// Returns the processor time that the host's daemon has used.
 fn processor_time(host: &Host) -> Duration {
     let stat = std::fs::read_to_string(format!("/proc/{}/stat", host.status().pid)).unwrap();
     let fields = stat.rsplit_once(") ").unwrap().1.split(' ');
@@ -178,7 +178,7 @@ fn link(what: &str, hosts: &mut [Host; 2], name: &Name, most: u64, sent: impl Fn
     }
 }
 
-/// Links hosts, with the settings that `plan` gives them, while each of all that may be forged is forged.
+/// Links hosts with the settings that `plan` gives them, under each kind of forgery.
 fn link_through_forged(plan: impl Fn([Settings; 2]) -> Plan) {
     let dir = tempfile::tempdir().unwrap();
     let none = || [classic(&[]), classic(&[])];

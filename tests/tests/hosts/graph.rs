@@ -51,7 +51,7 @@ impl Witness {
     }
 }
 
-/// Unlike any default in each of its policies.
+/// Returns a QoS that differs from any default in each of its policies.
 fn odd() -> Qos {
     Qos::default()
         .with_reliability(Reliability::BestEffort)

@@ -106,7 +106,7 @@ impl Camera {
         self.stranger.hear(met, ready).expect("an answer");
     }
 
-    /// Processor time of host A's daemon.
+    /// Returns the processor time of host A's daemon.
     fn cpu(&self) -> Duration {
         let pid = self.a.daemon.as_ref().unwrap().0.id();
         let stat = fs::read_to_string(format!("/proc/{pid}/stat")).unwrap();
@@ -115,7 +115,7 @@ impl Camera {
         Duration::from_millis(ticks.sum::<u64>() * 10)
     }
 
-    /// Bytes that host A's daemon has in memory, by this line of its status: now, and at most.
+    /// Returns the bytes in this line of the status of host A's daemon process: its memory now, or its maximum.
     pub(crate) fn memory(&self, line: &str) -> usize {
         self.a.memory(line)
     }

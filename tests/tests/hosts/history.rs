@@ -25,7 +25,7 @@ fn publish(publisher: &Publisher, samples: std::ops::RangeInclusive<u64>) {
     }
 }
 
-/// A subscription that comes now; it takes these samples, in order, and no others.
+/// Creates a subscription, and checks that it takes these samples, in order, and no others.
 fn joins_late(host: &Host, samples: std::ops::RangeInclusive<u64>) -> Subscription {
     let subscription = host.session("late").create_subscription(spec()).unwrap();
     let mut bytes = Vec::new();

@@ -33,7 +33,7 @@ impl Dice {
     }
 }
 
-/// A beacon as `docs/formats.md` has it, and as host `host` could send it, in classic.
+/// Returns a beacon as `docs/formats.md` specifies it, and as host `host` could send it, in classic.
 fn beacon(host: &Host) -> Vec<u8> {
     let mut bytes = b"\x01AXN\x01".to_vec();
     // A map: version 1 to 1, the domain, a daemon id, classic, port, one address, answer wanted.
@@ -46,7 +46,7 @@ fn beacon(host: &Host) -> Vec<u8> {
     bytes
 }
 
-/// Truncated, mutated, padded; the first is whole.
+/// Returns mutations of a beacon: truncated, mutated, padded. The first is the whole beacon.
 fn mutations(dice: &mut Dice, whole: &[u8]) -> Vec<Vec<u8>> {
     let mut all = vec![whole.to_vec()];
     all.extend((0..whole.len()).map(|length| whole[..length].to_vec()));

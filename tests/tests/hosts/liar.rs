@@ -17,7 +17,7 @@ use super::{
     stranger::Met,
 };
 
-/// A subscription to the peer's topic, here.
+/// Creates a subscription to the peer's topic, on this host.
 fn subscription(camera: &Camera) -> Subscription {
     let spec = EndpointSpec::new(TOPIC, TYPE, Qos::keep_all());
     camera.a.session("reader").create_subscription(spec).unwrap()
@@ -30,7 +30,7 @@ struct Lies {
 }
 
 impl Lies {
-    /// The peer's link, and the head of its stream.
+    /// Opens the peer's link, and creates the head of its stream.
     fn new(camera: &Camera) -> (Met, Self) {
         let (mut link, key) = (camera.link(0xff), SessionKey::generate().unwrap());
         camera.stranger.prove(&mut link, DaemonId([0xff; 16]), &[&key]);
@@ -60,7 +60,7 @@ impl Lies {
     }
 }
 
-/// `length` zeros in a zstd frame of RLE blocks, four bytes for each 128 KiB.
+/// Returns `length` zeros in a zstd frame of RLE blocks, four bytes for each 128 KiB.
 fn zeros(length: u32) -> Vec<u8> {
     const BLOCK: u32 = 128 << 10;
     let mut frame = vec![0x28, 0xb5, 0x2f, 0xfd, 0xa0];
@@ -109,8 +109,8 @@ fn highly_compressed_samples_arrive_in_order_without_delaying_other_topics() {
     assert_eq!(link.connection.close_reason(), None);
 }
 
-/// A peer publishes samples of these numbers. The daemon delivers 1 and 2, and refuses and counts the others. `reason`
-/// is its log text for a refused sample.
+/// Makes a peer publish samples of these numbers. The daemon delivers 1 and 2, and refuses and counts the others.
+/// `reason` is its log text for a refused sample.
 fn numbers_are_refused(numbers: &[u64], reason: &str) -> (Camera, Met) {
     let camera = Camera::new();
     let subscription = subscription(&camera);

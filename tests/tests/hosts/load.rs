@@ -16,7 +16,7 @@ fn hosts() -> [Host; 2] {
     Plan::new([classic(&[]), classic(&[])]).start()
 }
 
-/// A publisher on the first host and a subscription on the second that have met.
+/// Creates a publisher on the first host and a matched subscription on the second.
 pub(crate) fn across(hosts: &[Host; 2], topic: &str, qos: Qos) -> (Publisher, Subscription) {
     let (here, there) = (hosts[0].session("publisher"), hosts[1].session("subscription"));
     let spec = || EndpointSpec::new(topic, "test/Bytes", qos);

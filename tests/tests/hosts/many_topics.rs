@@ -49,7 +49,7 @@ fn refused(host: &Host) -> usize {
     links.iter().map(|link| link.routes_refused.len() + link.more_routes_refused).sum()
 }
 
-/// Two hosts that have little room for each other.
+/// Starts two hosts that have little room for each other.
 fn small_hosts() -> [Host; 2] {
     let plan = Plan::new([classic(&[]), classic(&[])]);
     Plan { graph_mb: Some(1), ..plan }.start()
@@ -172,7 +172,7 @@ fn excess_topics_are_named_on_the_subscribing_host_and_disturb_no_others() {
     }
 }
 
-/// The reasons that a host's status shows at an endpoint for which nothing flows.
+/// Returns the reasons that a host's status shows at an endpoint for which nothing flows.
 fn waits(host: &Host, gid: Gid) -> Vec<String> {
     let topics = host.status().topics;
     let refused = topics.into_iter().flat_map(|topic| topic.refused);
@@ -277,7 +277,7 @@ fn twenty_thousand_topics_cross_between_two_hosts() {
     }
 }
 
-/// Processor time that all threads of a host's daemon have used.
+/// Returns the processor time that all threads of a host's daemon have used.
 fn processor(host: &Host) -> Duration {
     let pid = host.daemon.as_ref().unwrap().0.id();
     let tasks = fs::read_dir(format!("/proc/{pid}/task")).unwrap();

@@ -8,7 +8,7 @@ use super::{
     process::until,
 };
 
-/// Both hosts name `variable`, and there is no link.
+/// Checks that both hosts name `variable`, and that there is no link.
 fn differ(settings: [Settings; 2], variable: &str) {
     let hosts = Plan::new(settings).start();
     for host in &hosts {

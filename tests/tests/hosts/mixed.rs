@@ -57,8 +57,8 @@ fn take_all(subscription: &Subscription, from: u64, last: u64) {
     assert_eq!(subscription.lost(), 0);
 }
 
-/// A publisher on the first host, a session on the second, and a subscription there to which samples
-/// cross already.
+/// Creates a publisher on the first host, a session on the second, and a subscription there, and waits until samples
+/// cross.
 fn crossing(hosts: &[Host; 2], topic: &str, qos: Qos) -> (Publisher, Session, Subscription) {
     let (here, there) = (hosts[0].session("publisher"), hosts[1].session("subscriptions"));
     let publisher = here.create_publisher(spec(topic, Qos::keep_all())).unwrap();
@@ -72,7 +72,7 @@ fn crossing(hosts: &[Host; 2], topic: &str, qos: Qos) -> (Publisher, Session, Su
     (publisher, there, first)
 }
 
-/// Another subscription, to which samples cross from now on.
+/// Creates another subscription, and waits until the publisher is matched with it: samples cross to it from then on.
 fn join(publisher: &Publisher, there: &Session, topic: &str, qos: Qos) -> Subscription {
     let subscription = there.create_subscription(spec(topic, qos)).unwrap();
     let gid = subscription.gid();

@@ -51,7 +51,7 @@ impl Kmes {
         Self { network, dir, runtime, drawn, tls }
     }
 
-    /// Settings of host 0 or 1 in qkd.
+    /// Returns settings of host 0 or 1 in qkd.
     pub(crate) fn settings(&self, host: usize, more: &[(&'static str, &str)]) -> Settings {
         let mut settings = self.network.sae(SAE[host]).unwrap().env(self.dir.path());
         settings.push(("AXON_SECURITY_MODE", "qkd".into()));
@@ -60,7 +60,7 @@ impl Kmes {
         settings
     }
 
-    /// Each key that was drawn so far, and its key_ID.
+    /// Returns each key that was drawn so far, and its key_ID.
     pub(crate) fn drawn(&self) -> Drawn {
         self.drawn.lock().unwrap().clone()
     }
@@ -73,7 +73,7 @@ impl Kmes {
         (key.key_id().to_owned(), key.expose_secret().to_vec())
     }
 
-    /// The secrets of all TLS connections of the KMEs so far, with their labels.
+    /// Returns the secrets of all TLS connections of the KMEs so far, with their labels.
     pub(crate) fn tls_secrets(&self) -> Drawn {
         self.tls.lock().unwrap().clone()
     }
@@ -98,7 +98,7 @@ impl Kmes {
         self.network.set_back();
     }
 
-    /// The URL of the KME of host 0 or 1.
+    /// Returns the URL of the KME of host 0 or 1.
     pub(crate) fn url(&self, host: usize) -> String {
         self.network.kmes()[host].url().to_owned()
     }
@@ -119,7 +119,7 @@ impl Kmes {
         }
     }
 
-    /// Keys that SAEs got by asking for new ones, and by key_ID.
+    /// Returns the number of keys that SAEs got as new ones, and by key_ID.
     pub(crate) fn keys(&self) -> (u64, u64) {
         let counters = self.network.kmes().iter().map(|kme| kme.counters());
         counters.fold((0, 0), |(masters, slaves), c| {
@@ -135,7 +135,7 @@ fn set(settings: &mut Settings, more: &[(&'static str, &str)]) {
     }
 }
 
-/// Settings as they are written.
+/// Returns settings of a host in classic.
 pub(crate) fn classic(more: &[(&'static str, &str)]) -> Settings {
     let mut settings = vec![("AXON_SECURITY_MODE", "classic".into())];
     set(&mut settings, more);

@@ -49,7 +49,7 @@ fn in_messages10_an_honest_start_records_no_refusal() {
     starts_without_a_refusal("messages10");
 }
 
-/// The KME of host `failing` fails in one call until it works again.
+/// Tests that one call fails at the KME of host `failing` until it works again.
 fn is_named_once(failing: usize, call: Method, name: &str) {
     let kmes = Kmes::start();
     let hosts = hosts(&kmes, "messages10");
@@ -84,7 +84,7 @@ fn a_kme_that_gives_no_keys_by_name_is_named_once() {
     is_named_once(1, Method::DecKeys, "dec_keys");
 }
 
-/// One call of host `failing` to its KME gets no answer. Keys come by the calls after it meanwhile.
+/// Tests that one call of host `failing` to its KME gets no answer. The calls after it bring keys meanwhile.
 fn holds_up_no_other(failing: usize, call: Method, name: &str) {
     let kmes = Kmes::start();
     let more = [("AXON_QKD_KEY_MODE", "messages10"), ("AXON_KME_ANSWER_TIMEOUT", "10")];
@@ -121,7 +121,7 @@ fn a_call_for_keys_by_name_that_hangs_holds_up_no_other() {
     holds_up_no_other(1, Method::DecKeys, "dec_keys");
 }
 
-/// No call to the KME of host `failing` is answered within five seconds. Messages go on afterwards.
+/// Tests that no call to the KME of host `failing` is answered within five seconds. Messages go on afterwards.
 fn hangs_as_a_whole(failing: usize, call: Method, name: &str) {
     const HANGS: Duration = Duration::from_secs(5);
     let kmes = Kmes::start();

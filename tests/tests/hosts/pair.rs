@@ -75,7 +75,7 @@ impl Plan {
         hosts
     }
 
-    /// Both hosts without a daemon: a process of theirs starts it.
+    /// Prepares both hosts without a daemon: a process of theirs starts it.
     pub(crate) fn prepare(self) -> [Host; 2] {
         static PAIRS: AtomicU32 = AtomicU32::new(0);
         let (pair, pid) = (PAIRS.fetch_add(1, Ordering::Relaxed), std::process::id());
@@ -133,7 +133,7 @@ struct DomainLease(u32);
 static DOMAINS_IN_USE: Mutex<BTreeSet<u32>> = Mutex::new(BTreeSet::new());
 
 impl DomainLease {
-    /// The first pair of free domains from this one on.
+    /// Reserves the first pair of free domains from this one on.
     fn next(from: u32) -> Self {
         let mut in_use = DOMAINS_IN_USE.lock().unwrap();
         // Below 100: the tool's tests, whose daemons may still be in their grace time, are above.
@@ -210,12 +210,12 @@ impl Host {
         });
     }
 
-    /// The wire to this host, which runs already, of a plan that is `wired`.
+    /// Returns the wire to this host, which runs already, of a plan that is `wired`.
     pub(crate) fn wire(&self) -> Wire {
         self.wire_at([3, 4])
     }
 
-    /// The second wire of a plan with two paths.
+    /// Returns the second wire of a plan with two paths.
     pub(crate) fn second_wire(&self) -> Wire {
         self.wire_at([5, 6])
     }
@@ -270,13 +270,13 @@ impl Host {
         &self.env.iter().find(|(n, _)| n == name).unwrap().1
     }
 
-    /// The configuration that its processes have, for this very process.
+    /// Returns the configuration of the host's processes, for this process.
     pub(crate) fn config(&self) -> Config {
         let env = self.env.iter().map(|(n, v)| (OsString::from(n), OsString::from(v)));
         Config::resolve(env.filter(|(n, _)| n != "RUST_BACKTRACE"), None, &OsFiles).unwrap()
     }
 
-    /// Bytes that its daemon has in memory, by this line of its `/proc/PID/status`.
+    /// Returns the bytes in this line of `/proc/PID/status` of the host's daemon.
     pub(crate) fn memory(&self, line: &str) -> usize {
         let pid = self.daemon.as_ref().unwrap().0.id();
         let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap();
@@ -301,7 +301,7 @@ impl Host {
         status.unwrap()
     }
 
-    /// The link to the one peer, once it stands.
+    /// Waits for the link to the one peer, and returns its status.
     #[track_caller]
     pub(crate) fn link(&self) -> LinkStatus {
         let mut links = Vec::new();
@@ -331,7 +331,7 @@ impl Host {
         });
     }
 
-    /// Bytes of its daemon's log.
+    /// Returns the number of bytes in the daemon's log.
     pub(crate) fn log_bytes(&self) -> usize {
         self.all_logs().len()
     }
@@ -359,14 +359,14 @@ impl Host {
         self.node(&["publish", TOPIC, sizes.name(), &readers.to_string(), "flood"])
     }
 
-    /// A subscriber, once it is there.
+    /// Starts a subscriber, and waits until it is ready.
     pub(crate) fn subscribe(&self, sizes: Sizes) -> Node {
         let mut node = self.node(&["subscribe", TOPIC, sizes.name()]);
         node.wait_ready();
         node
     }
 
-    /// A session of this very process on this host.
+    /// Opens a session of this process on this host.
     pub(crate) fn session(&self, name: &str) -> Session {
         Session::open(&self.config(), SessionOptions::new(name)).unwrap()
     }
@@ -382,14 +382,14 @@ impl Host {
         self.node_with(&[], arguments)
     }
 
-    /// A process with settings of its own beside the host's.
+    /// Starts a process with settings of its own beside the host's.
     pub(crate) fn node_with(&self, settings: &[(&str, &str)], arguments: &[&str]) -> Node {
         let mut command = self.command(env!("CARGO_BIN_EXE_axon-test-node"));
         command.args(arguments).envs(settings.iter().copied());
         Node::start(command)
     }
 
-    /// A process of another user, which runs a program that it can read.
+    /// Starts a process of another user, which runs a program that it can read.
     pub(crate) fn node_of(&self, program: &Path, uid: u32, arguments: &[&str]) -> Node {
         let mut command = self.command(program.to_str().unwrap());
         command.args(arguments).uid(uid).gid(uid);
@@ -429,7 +429,7 @@ impl Drop for Stopped {
     }
 }
 
-/// A private key, for its owner alone.
+/// Writes a private key that only its owner can read.
 pub(crate) fn write_key(path: &Path, pem: &str) {
     fs::write(path, pem).unwrap();
     fs::set_permissions(path, fs::Permissions::from_mode(0o600)).unwrap();

@@ -18,7 +18,7 @@ const TWO: (&str, &str) = ("AXON_LINK_PATHS", "2");
 const SECOND: [&str; 1] = ["a second link stands by"];
 const TAKES_OVER: [&str; 1] = ["the second link takes over"];
 
-/// Two hosts with a wire for each path.
+/// Starts two hosts with a wire for each path.
 fn wired_twice(settings: [Settings; 2]) -> ([Host; 2], [Wire; 2]) {
     let [mut a, mut b] = Plan { wired: true, paths: 2, ..Plan::new(settings) }.prepare();
     b.start();

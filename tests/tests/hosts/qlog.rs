@@ -14,7 +14,7 @@ use super::{
 
 const SECRET: &[u8] = b"no file of events may have this payload";
 
-/// Two hosts of which each writes to a directory of its own, and samples that crossed.
+/// Starts two hosts, each of which writes to a directory of its own, and waits until samples have crossed.
 fn hosts(directory: impl Fn(&Path) -> std::path::PathBuf) -> [Host; 2] {
     let mut hosts = Plan::new([classic(&[]), classic(&[])]).prepare();
     for host in &mut hosts {

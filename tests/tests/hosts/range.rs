@@ -32,7 +32,7 @@ fn spec() -> EndpointSpec {
     EndpointSpec::new(TOPIC, "test/Bytes", Qos::keep_all())
 }
 
-/// A session of this process on `host`, with a range and static peers of its own.
+/// Opens a session of this process on `host`, with a range and static peers of its own.
 fn open(host: &Host, range: DiscoveryRange, lists: &[&Host]) -> Session {
     Session::open(&ranged(host, range, lists), SessionOptions::new(range.name())).unwrap()
 }

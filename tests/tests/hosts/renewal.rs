@@ -15,7 +15,7 @@ use super::{
 /// Longer than a superseded link is kept for nothing.
 const LONG: Duration = Duration::from_secs(6);
 
-/// With keys of this age in seconds.
+/// Renews links with keys of this age in seconds.
 fn renew(key_mode: &str, age: &str, publish: impl Fn(&Host) -> Node) -> (u64, Tally) {
     let kmes = Kmes::start();
     let more = [("AXON_QKD_KEY_MODE", key_mode), ("AXON_QKD_SESSION_MAX_AGE", age)];

@@ -20,7 +20,7 @@ fn spec(qos: Qos) -> EndpointSpec {
     EndpointSpec::new(TOPIC, "test/Bytes", qos)
 }
 
-/// A publisher on the first host and a subscription on the second that have met.
+/// Creates a publisher on the first host and a matched subscription on the second.
 fn across(hosts: &[Host; 2], qos: Qos) -> (Publisher, Subscription) {
     across_with(hosts, qos, [true, true])
 }

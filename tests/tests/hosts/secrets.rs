@@ -98,7 +98,8 @@ const TEXT: &str = "KME key, base64";
 /// connection to the KME. A daemon has up to eight connections.
 const KEYS_IN_TEXT: usize = 32;
 
-/// Keys that wait for their use are in locked memory alone. Ciphers and the secrets of a connection are in use.
+/// Returns whether a finding is permitted. Keys that wait for their use are only in locked memory. Ciphers and the
+/// secrets of a connection are in use.
 fn is_allowed(find: &Find) -> bool {
     match find.secret.kind {
         "KME key" => find.guarded,
@@ -118,7 +119,8 @@ impl Hosts {
         Self { hosts, wire, kmes, recorded, nonces: RefCell::default(), reads_nonces }
     }
 
-    /// Each key drawn so far, all that a daemon derives of one, and the secrets of the connections that were recorded.
+    /// Returns each key drawn so far, all secrets that a daemon derives from one, and the secrets of the recorded
+    /// connections.
     fn sought(&self) -> Sought {
         let mut needles = Needles::default();
         let drawn = self.kmes.drawn();
@@ -287,7 +289,7 @@ impl Hosts {
     }
 }
 
-/// Messages that were sealed under keys which are no more.
+/// Returns the number of messages that were sealed under keys which are gone.
 fn retired(host: &Host) -> u64 {
     let keys = host.status().keys;
     let peers = keys["peers"].as_object().unwrap();
@@ -302,7 +304,7 @@ pub(crate) fn may_search() -> bool {
     root
 }
 
-/// At the end one of the daemons ends.
+/// Tests `messages10`. At the end the daemon of host `ends` ends.
 fn in_messages10(ends: usize) {
     if !may_search() {
         return;
@@ -336,7 +338,7 @@ fn in_messages10_ciphers_of_a_link_that_ended_are_nowhere_at_its_sender() {
     in_messages10(1);
 }
 
-/// Links are renewed under new keys while samples flow: the key of each of them is spent.
+/// Tests `session`: links are renewed under new keys while samples flow, and each link spends its key.
 fn in_session(kex: &str) {
     if !may_search() {
         return;

@@ -62,7 +62,7 @@ fn receive(client: &Client, number: u64, asked: &[u8]) {
     assert!(response == asked, "another's response, or a broken one");
 }
 
-/// In each way in which two hosts may be set up.
+/// Runs the test for each way in which two hosts may be set up.
 fn in_all(test: impl Fn([Host; 2])) {
     test(Plan::new([classic(&[]), classic(&[])]).start());
     for key_mode in ["session", "messages10"] {
@@ -298,9 +298,9 @@ fn serve(server: &Server, over: &AtomicBool) -> Calls {
     }
 }
 
-/// Two servers on each host answer a client on the other one while the link between them breaks: the wire is cut for
-/// some seconds, and then works for new connections alone. Each server sees each request once, and each client gets
-/// each response once.
+/// Tests services while the link breaks. Two servers on each host answer a client on the other one. The wire is cut for
+/// some seconds, and then works only for new connections. Each server must see each request once, and each client must
+/// get each response once.
 fn calls_outlive_a_link(settings: [Settings; 2]) {
     let (hosts, wire) = wired(settings);
     let sessions = hosts.each_ref().map(|host| host.session("calls"));

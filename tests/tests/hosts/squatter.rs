@@ -34,18 +34,18 @@ fn numbered(session: Gid, number: u32) -> Gid {
     gid
 }
 
-/// The endpoint that a session will make as its `number`th, as the squatter announces it.
+/// Returns the endpoint that a session will make as its `number`th, as the squatter announces it.
 fn claim(session: Gid, number: u32) -> Endpoint {
     Endpoint::new(numbered(session, number), EndpointKind::Publisher, TOPIC, TYPE)
         .with_node("squatter", "/")
 }
 
-/// The node of an endpoint, as this session sees it.
+/// Returns the node of an endpoint, as this session sees it.
 fn node_of(session: &Session, gid: Gid) -> Option<String> {
     session.graph().endpoints.get(&gid).map(|entry| entry.endpoint.node.clone())
 }
 
-/// Ten samples arrive, of which the first has the number `first`.
+/// Checks that ten samples arrive, the first of which has the number `first`.
 #[track_caller]
 fn flows(publisher: &Publisher, subscription: &Subscription, first: u64) {
     let mut bytes = Vec::new();

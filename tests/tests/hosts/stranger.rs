@@ -204,7 +204,7 @@ impl Stranger {
         came
     }
 
-    /// Why the other side closed the connection.
+    /// Waits until the other side closes the connection, and returns its reason.
     pub(crate) fn closed(&self, met: &Met) -> String {
         self.limited(met.connection.closed()).to_string()
     }
@@ -244,7 +244,7 @@ fn hello(domain: u32, claim: &Claim<'_>) -> LinkHello {
     }
 }
 
-/// The next message of a known type, `None` at the end of the stream.
+/// Reads the next message of a known type, `None` at the end of the stream.
 async fn next(receive: &mut RecvStream) -> Option<LinkMessage> {
     loop {
         let mut length = [0; 4];

@@ -205,7 +205,7 @@ fn a_host_that_falls_silent_holds_up_no_reader_of_another_one_for_long() {
     }
 }
 
-/// A service, as the sessions of the host have it.
+/// Returns a service, as the sessions of the host use it.
 fn service() -> EndpointSpec {
     EndpointSpec::new(SERVICE, TYPE, Qos::keep_all())
 }
@@ -236,7 +236,7 @@ fn ask(stranger: &Stranger, met: &mut Met, kind: EndpointKind) {
     stranger.say(met, &LinkMessage::Subscribe(subscribe));
 }
 
-/// A peer that has this end of the service.
+/// Links a peer that has this end of the service.
 fn at_service(host: &Host, kind: EndpointKind, idler: Idler) -> (Stranger, Met) {
     let (stranger, auth) = (Stranger::new(), Auth::None(SigningKey::generate().unwrap()));
     let claim = Claim { host: "idle", daemon: DaemonId([0xff; 16]), auth: 0 };
@@ -310,7 +310,7 @@ fn repeated_asking_for_responses_holds_up_no_server_for_long() {
     takes_no_response(Idler::AsksAgain);
 }
 
-/// A peer's client sends requests and takes no response.
+/// Tests a peer whose client sends requests and takes no response.
 fn takes_no_response(idler: Idler) {
     const REQUESTED: u64 = 150;
     let [host, _other] = Plan { stalled_s: 3, ..Plan::new([classic(&[]), classic(&[])]) }.start();

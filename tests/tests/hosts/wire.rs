@@ -87,7 +87,7 @@ pub(crate) struct Wire {
 }
 
 impl Wire {
-    /// A wire to `server` that begins at `near` and comes out of an address `far`.
+    /// Starts a wire to `server` that begins at `near` and sends from an address `far`.
     pub(crate) fn between(near: SocketAddr, far: SocketAddr, server: SocketAddr) -> Self {
         let [near, towards] = [near, far].map(|address| {
             let socket = UdpSocket::bind(address).unwrap();
@@ -166,7 +166,7 @@ impl Wire {
         rustix::net::sockopt::set_ip_tos(&self.towards, CONGESTION_EXPERIENCED).unwrap();
     }
 
-    /// All gets through again.
+    /// Lets all datagrams through again.
     pub(crate) fn mend(&self) {
         self.passes.store(ALL, Ordering::Relaxed);
     }

@@ -6,7 +6,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 static LIVE: AtomicUsize = AtomicUsize::new(0);
 
-/// Bytes that were asked for and not given back.
+/// Returns the number of bytes that are allocated.
 pub(crate) fn bytes() -> usize {
     LIVE.load(Ordering::SeqCst)
 }

@@ -34,7 +34,7 @@ fn client(kmes: &Kmes, sae: &str) -> Client {
     kmes.simulated(sae).build().unwrap()
 }
 
-/// Bytes in use after each round. The rounds after the warm-up must not need more than it did.
+/// Checks the bytes in use after each round. The rounds after the warm-up must not need more than the warm-up did.
 async fn no_growth(what: &str, mut round: impl AsyncFnMut()) {
     let mut used = Vec::with_capacity(WARM_UP + ROUNDS);
     for _ in 0..WARM_UP + ROUNDS {

@@ -40,12 +40,12 @@ impl Kmes {
         Self { child, _stdin: stdin, dir, urls }
     }
 
-    /// Settings for the simulated KME of `sae`.
+    /// Returns settings for the simulated KME of `sae`.
     pub(crate) fn simulated(&self, sae: &str) -> ClientBuilder {
         self.settings(sae, usize::from(sae == "sae-b"))
     }
 
-    /// Settings of `sae` for a KME by its number: the simulated ones are 0 and 1.
+    /// Returns settings of `sae` for a KME by its number: the simulated ones are 0 and 1.
     pub(crate) fn settings(&self, sae: &str, kme: usize) -> ClientBuilder {
         Client::builder()
             .kme_url(&self.urls[kme])
@@ -55,7 +55,7 @@ impl Kmes {
             .retry(RetryPolicy::none())
     }
 
-    /// A file that the KMEs wrote, as `sae-a.key`.
+    /// Returns the path of a file that the KMEs wrote, such as `sae-a.key`.
     pub(crate) fn file(&self, name: &str) -> PathBuf {
         self.dir.path().join(name)
     }
@@ -68,8 +68,8 @@ impl Drop for Kmes {
     }
 }
 
-/// In the child: serves until standard input ends, and beside the simulated KMEs the one that `another`
-/// starts with the files in that directory, if any. Elsewhere: nothing.
+/// In the child: serves until standard input ends. Beside the simulated KMEs it serves the one that `another` starts
+/// with the files in that directory, if any. Elsewhere: does nothing.
 pub(crate) fn serve_if_asked(max_keys: u64, another: impl FnOnce(&Path) -> Option<String>) {
     let Some(dir) = std::env::var_os(VARIABLE).map(PathBuf::from) else { return };
     let runtime = tokio::runtime::Runtime::new().unwrap();

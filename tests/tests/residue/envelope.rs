@@ -25,7 +25,7 @@ fn key_id(number: usize) -> KeyId {
     KeyId::new(format!("bc490419-7d60-487f-adc1-4ddcc177c1{number:02x}")).unwrap()
 }
 
-/// In the child: the next key, which goes from the pipe into this block and nowhere else.
+/// In the child: reads the next key, which goes from the pipe into this block and nowhere else.
 fn key(input: &mut impl Read) -> KmeKey {
     let mut bytes = Box::new([0; 32]);
     input.read_exact(&mut bytes[..]).unwrap();

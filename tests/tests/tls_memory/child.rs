@@ -34,7 +34,7 @@ pub(crate) const SERVER_SAE: &str = "sae-server";
 pub(crate) const EXPORTER: &str = "EXPORTER-axon-test";
 const SENT: usize = 70_000;
 
-/// The terms that both ends share.
+/// Returns the terms that both ends share.
 pub(crate) fn terms(cipher: Cipher, mode: Mode, key: &[u8]) -> Terms<'_> {
     Terms { cipher, mode, key, key_id: KEY_ID, client: CLIENT_SAE, server: SERVER_SAE }
 }

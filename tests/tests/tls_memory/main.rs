@@ -171,7 +171,7 @@ fn nothing_is_left_of_psk_dhe_ke() {
     }
 }
 
-/// Each secret, where this process has the other end.
+/// Checks each secret of a connection whose other end is in this process.
 fn nothing_is_left_of_one_end(mode: Mode, is_client: bool) {
     for cipher in Cipher::ALL {
         let key = random();

@@ -31,7 +31,7 @@ impl<'a> Needles<'a> {
         Self { secrets, pieces, starts }
     }
 
-    /// The names of the secrets of which a piece is in the writable memory of a process.
+    /// Returns the names of the secrets of which a piece is in the writable memory of a process.
     pub(crate) fn found_in(&self, process: u32) -> Vec<String> {
         let memory = File::open(format!("/proc/{process}/mem")).unwrap();
         let maps = fs::read_to_string(format!("/proc/{process}/maps")).unwrap();

@@ -49,7 +49,7 @@ pub(crate) struct Learnt {
 }
 
 impl TappedEnd {
-    /// A client, which [`dial`](Self::dial)s.
+    /// Creates a client, which [`dial`](Self::dial)s.
     pub(crate) fn client(terms: Terms<'_>) -> Self {
         let told = Told::default();
         let messages = Messages::default();
@@ -67,7 +67,7 @@ impl TappedEnd {
         Self { told, messages, runtime, endpoint }
     }
 
-    /// A server, and its port.
+    /// Creates a server, and returns it with its port.
     pub(crate) fn server(terms: Terms<'_>) -> (Self, u16) {
         let told = Told::default();
         let messages = Messages::default();

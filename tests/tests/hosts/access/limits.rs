@@ -35,14 +35,14 @@ fn publish(publisher: &Publisher) {
     }
 }
 
-/// The next sample that comes.
+/// Takes the next sample, and returns its number.
 fn next(subscription: &Subscription) -> u64 {
     let mut bytes = Vec::new();
     subscription.recv(&mut bytes, Some(PATIENCE)).expect("a sample");
     u64::from_be_bytes(bytes.try_into().unwrap())
 }
 
-/// The limit of a topic, as the robot shows it by now.
+/// Returns the limit of a topic in the robot's current status.
 fn limit(hosts: &Hosts, name: &str) -> LimitStatus {
     let limits = hosts.robot.link().limits;
     limits.into_iter().find(|limit| limit.name == name).unwrap_or_default()
@@ -131,7 +131,7 @@ fn publish_long(publisher: &Publisher) {
     }
 }
 
-/// Bytes that no compressor makes shorter.
+/// Returns bytes that no compressor makes shorter.
 fn noise(length: usize) -> Vec<u8> {
     let mut state = 1_u64;
     let mut next = || {
@@ -143,7 +143,7 @@ fn noise(length: usize) -> Vec<u8> {
     (0..length).map(|_| next()).collect()
 }
 
-/// The next long sample that comes.
+/// Takes the next long sample, and returns its number.
 fn next_long(subscription: &Subscription) -> u64 {
     let mut bytes = Vec::new();
     subscription.recv(&mut bytes, Some(PATIENCE)).expect("a sample");

@@ -33,7 +33,7 @@ impl Drop for NodeOfOthers {
     }
 }
 
-/// A host whose daemon lets another user in, under these rules; `None` where only one user can be played.
+/// Starts a host whose daemon admits another user, under these rules; `None` if the test can play only one user.
 fn host_of_two(rules: &str) -> Option<(Host, Session)> {
     if !rustix::process::geteuid().is_root() {
         eprintln!("skipped: only root can be two users");
@@ -51,7 +51,7 @@ fn host_of_two(rules: &str) -> Option<(Host, Session)> {
     Some((host, session))
 }
 
-/// The rules of a host.
+/// Returns the path of a host's rules.
 fn path_of(host: &Host) -> PathBuf {
     host.dir.path().join("access.toml")
 }

@@ -85,7 +85,7 @@ impl Link {
         Self { name, runtime, hosts, kmes, told: Told::default() }
     }
 
-    /// The daemon accepts.
+    /// Dials the daemon.
     fn dial(&self, cipher: Cipher) -> Stands {
         let local = (Ipv4Addr::LOCALHOST, 0).into();
         let [host, _] = &self.hosts;
@@ -104,7 +104,7 @@ impl Link {
         })
     }
 
-    /// The daemon dials.
+    /// Accepts the dial of the daemon.
     fn accept(&self, cipher: Cipher) -> Stands {
         let [host, other] = &self.hosts;
         let config = tapped::server(cipher, &self.kmes, &self.told);

@@ -44,7 +44,7 @@ fn external(terms: Terms<'_>) -> Arc<ExternalPsk> {
     Arc::new(ExternalPsk::new(identity, Schedule::psk(terms).into(), hash).unwrap())
 }
 
-/// The configuration of a client on these terms.
+/// Returns the configuration of a client on these terms.
 pub(super) fn client(terms: Terms<'_>, told: &Told) -> quinn::ClientConfig {
     let psks = vec![external(terms)];
     let mut config = ClientConfig::builder_with_provider(provider(terms.cipher, told))
@@ -55,7 +55,7 @@ pub(super) fn client(terms: Terms<'_>, told: &Told) -> quinn::ClientConfig {
     quinn::ClientConfig::new(quic::axon::client(config))
 }
 
-/// The configuration of a server, as the SAE of host 1, that knows each key which the SAE of host 0 draws.
+/// Returns the configuration of a server, as the SAE of host 1, that knows each key which the SAE of host 0 draws.
 pub(super) fn server(cipher: Cipher, kmes: &Arc<Kmes>, told: &Told) -> quinn::ServerConfig {
     let drawn = Arc::new(Drawn(cipher, kmes.clone()));
     let mut config = ServerConfig::builder_with_provider(provider(cipher, told))

@@ -31,7 +31,7 @@ impl Authority {
         Self { pem, issuer: Issuer::new(params, key) }
     }
 
-    /// For one DNS name, good until the year begins.
+    /// Issues a certificate for one DNS name, valid until the year begins.
     pub(crate) fn issue(&self, name: &str, serial: u64, until: i32) -> Certificate {
         self.issue_for(&[name], serial, until)
     }
@@ -48,7 +48,7 @@ impl Authority {
         Certificate { pem, key: key.serialize_pem() }
     }
 
-    /// A list of one certificate, good until the year begins.
+    /// Issues a revocation list of one certificate, valid until the year begins.
     pub(crate) fn revoke(&self, serial: u64, until: i32) -> String {
         let revoked = RevokedCertParams {
             serial_number: SerialNumber::from(serial),
@@ -68,7 +68,7 @@ impl Authority {
     }
 }
 
-/// Settings of host `host`, with its files in `dir`.
+/// Returns the settings of host `host`, with its files in `dir`.
 pub(crate) fn settings(
     dir: &Path,
     host: &str,

@@ -19,7 +19,7 @@ const A: u64 = 1;
 const B: u64 = 2;
 const NOBODY: u64 = 9;
 
-/// Two hosts with certificates of one CA; host A has a revocation list if `crl` is one.
+/// Starts two hosts with certificates of one CA; host A has a revocation list if `crl` is one.
 fn start(dir: &Path, ca: &Authority, b: &Certificate, crl: Option<&str>) -> [Host; 2] {
     let a = ca.issue("host-a", A, 2100);
     let a = settings(dir, "a", &ca.pem, &a, crl);

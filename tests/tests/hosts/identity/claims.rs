@@ -18,8 +18,8 @@ use super::{
     daemon_id,
 };
 
-/// A claim of B's id is refused while its link stands, and ends with B's next link where it came first. A calls the peer
-/// that claims it `name`.
+/// Checks that a claim of B's id is refused while B's link stands. A claim that came first ends with B's next link. A
+/// calls the peer that claims it `name`.
 fn keeps_nobody_out(
     a: &mut Host,
     b: &Host,

@@ -8,7 +8,7 @@ mod claims;
 mod pinned;
 mod replay;
 
-/// An id as status has it.
+/// Parses an id as status shows it.
 fn daemon_id(text: &str) -> DaemonId {
     let byte = |at: usize| u8::from_str_radix(&text[2 * at..2 * at + 2], 16).unwrap();
     DaemonId(std::array::from_fn(byte))

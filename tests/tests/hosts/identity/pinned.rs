@@ -21,13 +21,13 @@ fn trust_of(dir: &Path, host: usize) -> PathBuf {
     dir.join(format!("host-{host}.trust"))
 }
 
-/// The line for the key in a file.
+/// Returns the line of a trust file for the key in a file.
 fn line(name: &str, key: &Path) -> String {
     let key = SigningKey::from_pem(&fs::read_to_string(key).unwrap()).unwrap();
     format!("{name} {}\n", key.spki_digest())
 }
 
-/// Another key in `dir`, not yet in use.
+/// Creates another key in `dir`, not yet in use.
 fn new_key(dir: &Path) -> PathBuf {
     let path = dir.join("new.key");
     let pem = SigningKey::generate_pem_with(KeyAlgorithm::Ed25519).unwrap();

@@ -41,7 +41,7 @@ pub(crate) struct Connection {
 }
 
 impl Connection {
-    /// `key` is that of the connection.
+    /// Computes the secrets of a connection with the key in `terms`.
     fn new(terms: Terms<'_>, transcript: &[u8], shared: Option<&[u8]>) -> Self {
         let schedule = Schedule::new(terms, transcript, shared);
         let is_psk = |secret: &&Secret| secret.name == "pre-shared key";
@@ -144,7 +144,7 @@ pub(crate) fn connections(
     connections
 }
 
-/// The terms and both hellos of a handshake that a server answered.
+/// Returns the terms and both hellos of a handshake that a server answered.
 fn begun<'a>(
     client: &[u8],
     server: &[u8],

@@ -46,7 +46,7 @@ impl<'a> Bytes<'a> {
         self.take(1).map(|byte| byte[0])
     }
 
-    /// A variable-length integer (RFC 9000, section 16).
+    /// Reads a variable-length integer (RFC 9000, section 16).
     fn integer(&mut self) -> Option<usize> {
         let first = self.byte()?;
         let more = self.take((1 << (first >> 6)) - 1)?;
@@ -59,7 +59,7 @@ impl<'a> Bytes<'a> {
     }
 }
 
-/// The packets of a datagram that carry a part of a handshake.
+/// Returns the packets of a datagram that carry a part of a handshake.
 pub(super) fn packets(datagram: &[u8]) -> Vec<Packet<'_>> {
     let mut found = Vec::new();
     let mut rest = datagram;
@@ -113,14 +113,14 @@ impl From<DirectionalKeys> for Opens {
 }
 
 impl Opens {
-    /// For Initial packets of client and server: everybody knows the keys (RFC 9001, section 5.2).
+    /// Returns the keys for Initial packets of client and server, which are public (RFC 9001, section 5.2).
     pub(super) fn initial(destination: &[u8]) -> [Self; 2] {
         let suite = TLS13_AES_128_GCM_SHA256.tls13().and_then(|suite| suite.quic_suite()).unwrap();
         let keys = suite.keys(destination, Side::Client, Version::V1);
         [keys.local.into(), keys.remote.into()]
     }
 
-    /// For packets under this traffic secret.
+    /// Returns the keys for packets under this traffic secret.
     pub(super) fn with(cipher: Cipher, secret: &[u8]) -> Self {
         let suite = match cipher {
             Cipher::ChaCha20Poly1305 => TLS13_CHACHA20_POLY1305_SHA256,
@@ -134,21 +134,22 @@ impl Opens {
         }
     }
 
-    /// For packets under a later traffic secret, after a key update: the key of their headers stays (RFC 9001, section 6).
+    /// Returns the keys for packets under a later traffic secret, after a key update: the key of their headers stays
+    /// (RFC 9001, section 6).
     pub(super) fn updated(cipher: Cipher, first: &[u8], later: &[u8]) -> Self {
         let [first, later] = [first, later].map(|secret| Self::with(cipher, secret));
         Self { packet: later.packet, header: first.header }
     }
 
-    /// The frames of a packet; `None` if it is not one of that end.
+    /// Returns the frames of a packet; `None` if it is not a packet of that end.
     pub(super) fn open(&self, packet: &Packet<'_>) -> Option<Vec<u8>> {
         // A handshake has so few packets that their numbers are not truncated.
         let frames = self.open_at(packet.bytes, packet.number_at, 0);
         frames.map(|(_, frames)| frames)
     }
 
-    /// The number and the frames of a packet with a short header, of which `next` is expected; `None` if it is not one of
-    /// that end.
+    /// Returns the number and the frames of a packet with a short header; `next` is the expected number. `None` if it
+    /// is not a packet of that end.
     pub(super) fn open_short(&self, datagram: &[u8], next: u64) -> Option<(u64, Vec<u8>)> {
         self.open_at(datagram, 1 + CONNECTION_ID, next)
     }
@@ -171,7 +172,7 @@ impl Opens {
 /// Length of the connection IDs of daemons.
 const CONNECTION_ID: usize = 8;
 
-/// The packet number nearest to `next` that ends as this one, of `window` different ends (RFC 9000, A.3).
+/// Returns the packet number nearest to `next` with this ending, of `window` different endings (RFC 9000, A.3).
 fn whole_number(end: u64, window: u64, next: u64) -> u64 {
     let candidate = next & !(window - 1) | end;
     if candidate + window / 2 <= next {

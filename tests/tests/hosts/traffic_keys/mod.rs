@@ -53,7 +53,7 @@ const HELD_BY_RUSTLS: [&str; 4] = [
 /// The label that these tests export, to show that the secrets are those of the connection.
 const EXPORTER: &str = "EXPORTER-axon-test";
 
-/// HKDF-Expand-Label of RFC 8446, section 7.1, without a context.
+/// Computes HKDF-Expand-Label of RFC 8446, section 7.1, without a context.
 pub(crate) fn expand(secret: &[u8], label: &str, length: usize) -> Vec<u8> {
     let label = format!("tls13 {label}");
     let info: [&[u8]; 4] = [&[0, length as u8, label.len() as u8], label.as_bytes(), &[0], &[]];
@@ -116,7 +116,7 @@ async fn dial(host: &Host, config: quinn::ClientConfig) -> Stands {
     Stands { endpoint, connection, control }
 }
 
-/// The daemon of the first host dials this process.
+/// Accepts the dial of the first host's daemon in this process.
 async fn accept(
     hosts: &[Host; 2],
     config: quinn::ServerConfig,
@@ -129,7 +129,7 @@ async fn accept(
     Stands { endpoint, connection, control }
 }
 
-/// The secrets of the connection, each as a number, and their names.
+/// Returns the secrets of the connection, each as a number, and their names.
 fn needles(cipher: Cipher, learnt: &Learnt, connection: &Connection) -> (Needles, Vec<String>) {
     let terms = Terms { cipher, mode: Mode::Hybrid, key: b"", key_id: "", client: "", server: "" };
     let [shared, transcript] = [&learnt.shared, &learnt.transcript].map(|m| m.lock().unwrap());
@@ -193,7 +193,7 @@ fn of_a_link(auth: Auth, cipher: Cipher, daemon_dials: bool) {
     drop(session);
 }
 
-/// Each test of a cipher: the daemon accepts a link, and dials one.
+/// Runs each test of a cipher: the daemon accepts a link, and dials one.
 fn of_links(auth: Auth, cipher: Cipher) {
     for daemon_dials in [false, true] {
         of_a_link(auth, cipher, daemon_dials);
