@@ -3,7 +3,7 @@
 /// The evidence that a daemon is at the address that a beacon gives, the strongest first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum AddressConfidence {
-    /// A link with this very daemon stood there.
+    /// A link with this daemon stood there.
     Proven,
     /// This host lists the address or had a link with a peer there, and the daemon answered there.
     KnownAnswered,
@@ -18,7 +18,7 @@ pub enum AddressConfidence {
 impl AddressConfidence {
     /// Number of the levels.
     pub(super) const COUNT: usize = 5;
-    /// All of them, the best first.
+    /// All levels, the best first.
     pub(super) const ALL: [Self; Self::COUNT] =
         [Self::Proven, Self::KnownAnswered, Self::Known, Self::Answered, Self::Heard];
 }

@@ -6,7 +6,7 @@ use std::net::SocketAddr;
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Datagrams {
     bytes: Vec<u8>,
-    /// The sender of each, and where it ends.
+    /// The sender of each datagram, and the position of its end.
     all: Vec<(SocketAddr, usize)>,
 }
 

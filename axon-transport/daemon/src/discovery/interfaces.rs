@@ -11,7 +11,7 @@ use nix::{
     sys::socket::SockaddrStorage,
 };
 
-/// Most addresses looked at; a host with more has the rest ignored.
+/// Maximum number of addresses; further ones of a host are ignored.
 const MAX_ADDRESSES: usize = 64;
 
 /// One address of one network interface that is up.
@@ -19,9 +19,9 @@ const MAX_ADDRESSES: usize = 64;
 pub(crate) struct Interface {
     /// The name, as `ip link` shows it.
     pub name: String,
-    /// The kernel's number of it.
+    /// The kernel's number of the interface.
     pub index: u32,
-    /// One of its addresses.
+    /// One of the interface's addresses.
     pub address: IpAddr,
     /// The length of the subnet prefix, in bits.
     pub prefix: u8,

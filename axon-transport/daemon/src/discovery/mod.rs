@@ -63,7 +63,7 @@ pub(crate) const fn is_discovery(first_byte: u8) -> bool {
 /// A request of discovery to the daemon.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum DiscoveryAction {
-    /// Dial this daemon. To be answered with [`DiscoveryEvent::LinkUp`] or [`DiscoveryEvent::DialFailed`]; without
+    /// Dial this daemon. The daemon answers with [`DiscoveryEvent::LinkUp`] or [`DiscoveryEvent::DialFailed`]; without
     /// an answer it counts as failed after 30 s.
     Dial {
         /// The id of the expected daemon.
@@ -77,9 +77,9 @@ pub(crate) enum DiscoveryAction {
         /// The evidence for the addresses; the answer to the action repeats it.
         standing: AddressConfidence,
     },
-    /// A linked peer has these addresses, best first; they are candidates for a second path.
+    /// The addresses of a linked peer, best first; they are candidates for a second path.
     Addresses {
-        /// The peer.
+        /// The id of the peer.
         daemon: DaemonId,
         /// At most eight addresses.
         addresses: Vec<SocketAddr>,
@@ -93,11 +93,11 @@ pub(crate) enum DiscoveryAction {
     },
     /// This peer is not dialled; the mismatch is the reason. Reported once for each peer; after 32 peers, one a second.
     Mismatch(PeerMismatch),
-    /// The addresses that the names of static peers have.
+    /// The addresses of static peers, by name.
     Named(BTreeMap<String, Vec<IpAddr>>),
     /// No datagram of this peer arrived for long, or it said goodbye.
     Gone {
-        /// Which.
+        /// The id of the peer.
         daemon: DaemonId,
     },
 }
@@ -105,11 +105,11 @@ pub(crate) enum DiscoveryAction {
 /// A setting that keeps this daemon and a peer apart.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct PeerMismatch {
-    /// The peer, as it calls itself.
+    /// The daemon id that the peer states.
     pub peer: DaemonId,
     /// The source address of its beacon.
     pub address: SocketAddr,
-    /// The variable to look at.
+    /// The variable to check.
     pub setting: &'static str,
     /// This daemon's value.
     pub ours: String,

@@ -36,7 +36,7 @@ const TOGETHER_SHARED: usize = 512;
 /// it, the datagrams of one `REST` are handled together.
 const DATAGRAM_BURST: (u32, u32) = (32, 16);
 const REST: Duration = Duration::from_millis(20);
-/// Most addresses of one name.
+/// Maximum number of addresses of one name.
 const MOST_OF_A_NAME: usize = 4;
 
 /// A message from the daemon to discovery.
@@ -47,28 +47,28 @@ pub(crate) enum DiscoveryEvent {
     Datagrams(Datagrams),
     /// The QUIC port is bound. Discovery sends nothing before.
     QuicPort(u16),
-    /// A link stands, whichever side dialled it.
+    /// A link stands, from a dial of either side.
     LinkUp {
-        /// With this daemon.
+        /// The id of the peer.
         daemon: DaemonId,
-        /// At this address.
+        /// The address of the peer.
         address: SocketAddr,
         /// Whether the peer proved that the id is its own.
         proven: bool,
     },
     /// The last link with a daemon is gone.
     LinkDown {
-        /// Which.
+        /// The id of the peer.
         daemon: DaemonId,
     },
     /// A report whether the path of a link works.
     Path {
-        /// With this daemon.
+        /// The id of the peer.
         daemon: DaemonId,
         /// Whether the path works.
         works: bool,
     },
-    /// An [`DiscoveryAction::Dial`] became no link.
+    /// A [`DiscoveryAction::Dial`] did not lead to a link.
     DialFailed {
         /// The id of the dialled daemon.
         daemon: DaemonId,
@@ -140,7 +140,7 @@ pub(crate) async fn run(
                 if range != DiscoveryRange::Off {
                     shell.look_at_interfaces();
                 }
-                // A timer that is set fires, whether or not it is waited for.
+                // A timer that is set fires, even if it is not awaited.
                 if looks_for_somebody(range, &hosts) {
                     look.reset();
                 }
@@ -218,7 +218,7 @@ impl DiscoveryIo {
         listed.dedup();
         self.peers.set_listed(now, listed);
         self.names.clone_from(&names);
-        // One that is dropped is overtaken by the next.
+        // If the channel is full, the message is dropped; the next one replaces it.
         let _ = self.actions.try_send(DiscoveryAction::Named(names));
     }
 
@@ -334,7 +334,7 @@ async fn sleep_until_some(at: Option<Instant>) {
 type ResolvedHosts = Vec<((String, Option<u16>), Vec<IpAddr>)>;
 
 async fn look_up(hosts: BTreeSet<(String, Option<u16>)>) -> ResolvedHosts {
-    // At once: a name server that does not answer for one host holds up no other.
+    // The look-ups run in parallel: a name server that does not answer for one host delays no other.
     let mut lookups = JoinSet::new();
     for (host, port) in hosts {
         lookups.spawn(async move {

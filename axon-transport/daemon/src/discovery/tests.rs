@@ -21,12 +21,12 @@ fn config(domain: u32, env: &[(&str, &str)]) -> Config {
     Config::resolve(env.collect::<Vec<_>>(), None, &OsFiles).unwrap()
 }
 
-/// A daemon as far as discovery knows one: the task, and a UDP socket on a QUIC port.
+/// A daemon as discovery sees it: the task, and a UDP socket on a QUIC port.
 struct Daemon {
     id: DaemonId,
     address: SocketAddr,
     events: mpsc::Sender<DiscoveryEvent>,
-    /// All but the datagrams, which are carried.
+    /// All actions except the datagrams, which [`carry`] carries out.
     actions: mpsc::Receiver<DiscoveryAction>,
 }
 
@@ -47,7 +47,7 @@ impl Daemon {
         let (others, of_others) = mpsc::channel(64);
         events.send(DiscoveryEvent::QuicPort(address.port())).await.unwrap();
         tokio::spawn(async move {
-            // Held: there is one for as long as there is a daemon.
+            // The sender is kept as long as the daemon exists.
             let wanted = watch::Sender::new(DiscoveryNeeds::of(&config, []));
             run(&config, id, wanted.subscribe(), of_events, of_actions).await;
         });

@@ -7,7 +7,7 @@ use axon_transport::{
     internal::graph::Scope,
 };
 
-/// Most hosts that are looked for by address or name.
+/// Maximum number of hosts that are looked for by address or name.
 const MOST_HOSTS: usize = 128;
 
 /// The discovery that the sessions of a daemon need together.

@@ -80,8 +80,8 @@ impl Identity {
         !lock(&self.watch).is_empty()
     }
 
-    /// Looks whether the files changed, a few times a second; whether something else is in force
-    /// now. Blocks on the file system.
+    /// Looks whether the files changed; the caller does this a few times a second. Returns whether the identity in
+    /// force changed. Blocks on the file system.
     pub(crate) fn look(&self, now: Instant) -> bool {
         let mut watch = lock(&self.watch);
         match watch.look(now) {

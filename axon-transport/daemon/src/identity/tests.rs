@@ -177,7 +177,7 @@ fn world_writable_and_irregular_trust_files_are_refused() {
     host.second();
     host.closed_for(&["not a regular file"]);
     fs::remove_dir(&trust).unwrap();
-    // Opening it for reading waits for a writer, for ever.
+    // Opening the file for reading would wait for a writer, for ever.
     let (cwd, mode) = (rustix::fs::CWD, rustix::fs::Mode::from_raw_mode(0o600));
     rustix::fs::mkfifoat(cwd, &trust, mode).unwrap();
     host.second();
@@ -192,7 +192,7 @@ fn world_writable_and_irregular_trust_files_are_refused() {
 fn a_file_is_not_read_while_it_is_written() {
     let mut host = Host::new(line(1) + &line(2));
     let trust = host.file("trust");
-    // Truncated, then half of it, then all: with a look after each.
+    // The file is truncated, then half written, then complete, with a look after each step.
     for part in ["", &line(2), &(line(2) + &line(3)), &(line(2) + &line(3) + &line(4))] {
         fs::write(&trust, part).unwrap();
         assert!(!host.look(), "{part:?}");

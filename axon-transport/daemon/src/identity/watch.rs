@@ -1,4 +1,4 @@
-//! When files are to be read again: once they have changed, and are still.
+//! Decides when files are read again: once they have changed, and are still.
 
 use std::time::{Duration, Instant};
 
@@ -12,9 +12,9 @@ const LONGEST_WRITE: Duration = Duration::from_secs(5);
 pub(super) enum FilesChange {
     /// The files are as they were when they were read.
     Same,
-    /// One is being written.
+    /// A file is being written.
     Changing,
-    /// One is being written, and has been for too long.
+    /// A file is being written, and has been for too long.
     Restless,
     /// The files changed and no longer change: they must be read.
     Changed,
@@ -31,11 +31,11 @@ pub(super) struct FileWatcher {
     restless_since: Option<Instant>,
 }
 
-/// A file, or why there is none to use.
+/// The stamp of a file, or the reason why it cannot be used.
 type FileStamps = Result<FileStamp, String>;
 
 impl FileWatcher {
-    /// Files that are about to be read for the first time.
+    /// Creates a watcher of files that are about to be read for the first time.
     pub(super) fn new(files: Vec<NamedFile>) -> Self {
         let seen: Vec<_> = files.iter().map(NamedFile::stamp).collect();
         Self { files, read: Some(seen.clone()), seen, restless_since: None }

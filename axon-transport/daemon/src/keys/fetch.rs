@@ -10,17 +10,17 @@ use super::request::{Answer, FailureKind, Fetched, KeyPurpose, KmeRequest, Reque
 const TRIES: u8 = 3;
 /// Time between two tries, at least.
 const TRY: Duration = Duration::from_secs(2);
-/// Longest pause between two tries that a KME can ask for: the peer that announced the keys waits, too.
+/// Maximum pause between two attempts that a KME can ask for: the peer that announced the keys waits, too.
 const RETRY_AFTER_MAX: Duration = Duration::from_secs(10);
 /// Calls in flight at once.
 const IN_FLIGHT: usize = 4;
 
-/// Refused calls that a master may cause at once by names that the KME does not know, more than
-/// a restarted receiver of the most keys has, and how many a second after that.
+/// Number of refused calls that a master may cause at once with names that the KME does not know. It exceeds the
+/// calls of a restarted receiver with the maximum number of keys. The second constant is the number of further refused calls a second.
 const REFUSALS: f64 = 300.0;
 const REFUSALS_PER_SECOND: f64 = 5.0;
 
-/// The keys of one master that are being fetched. Bounded by its caller.
+/// The keys of one master that are being fetched. The caller limits their number.
 pub(super) struct Fetches {
     master: String,
     purpose: KeyPurpose,
@@ -33,7 +33,7 @@ pub(super) struct Fetches {
 struct KeyBatch {
     key_ids: Vec<KeyId>,
     tries_left: u8,
-    /// When it may be asked for; once asked, when it may be asked for again.
+    /// The time at which the batch may be requested; once requested, the time at which it may be requested again.
     not_before: Duration,
 }
 
@@ -87,7 +87,7 @@ impl Fetches {
         }
         match failure.kind {
             FailureKind::Refused if batch.key_ids.len() > 1 => {
-                // One unknown key_ID spoils a batch: the others may still be had.
+                // One unknown key_ID spoils a batch: the other keys may still be available.
                 let single = |key_id| KeyBatch {
                     key_ids: vec![key_id],
                     tries_left: TRIES,

@@ -36,7 +36,7 @@ pub enum KmeRequest {
     Dec {
         /// The SAE that called `enc_keys`.
         master: String,
-        /// Their names.
+        /// The key_IDs of the keys.
         key_ids: Vec<KeyId>,
         /// The purpose of the keys.
         purpose: KeyPurpose,
@@ -48,7 +48,7 @@ pub enum KmeRequest {
     },
 }
 
-/// A [`KmeRequest`] and how it ended.
+/// A [`KmeRequest`] and its result.
 #[derive(Debug)]
 pub struct Answer {
     /// The request, unchanged.
@@ -68,12 +68,12 @@ pub enum Fetched {
     Stock(Stock),
 }
 
-/// Why a [`KmeRequest`] failed. Never holds anything of a key.
+/// The reason why a [`KmeRequest`] failed. It never contains a part of a key.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RequestFailure {
     /// The class of the failure.
     pub kind: FailureKind,
-    /// For log and status.
+    /// The text for log and status.
     pub text: String,
     /// The pause that the KME asked for before it is asked again.
     pub retry_after: Option<Duration>,
@@ -82,16 +82,16 @@ pub struct RequestFailure {
 /// The class of a [`RequestFailure`], which decides the reaction to it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum FailureKind {
-    /// No connection; nothing was asked. Try later.
+    /// There is no connection, and no request was sent. Try later.
     Unreachable,
-    /// The KME cannot serve it now; an empty store is one reason. Try later.
+    /// The KME cannot serve the request now; an empty store is one reason. Try later.
     Unavailable,
     /// The KME knows no such key, or refuses the request. Repeating it is useless.
     Refused,
     /// The KME does not accept this SAE, or this host does not accept the KME: a matter of
     /// certificates.
     Unauthorized,
-    /// Cut off or answered badly after the request may have arrived: its keys may be consumed.
+    /// The call was cut off or got an invalid answer after the request may have arrived: its keys may be consumed.
     Ambiguous,
     /// The KME gave keys whose key_IDs it had given before. They are not used.
     Repeated,

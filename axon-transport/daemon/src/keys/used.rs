@@ -11,9 +11,9 @@ use std::{
 use etsi_qkd014::pool::{Ledger, LedgerError};
 use serde::Serialize;
 
-/// Key_IDs that the file remembers at least: some 16 MiB in two files, and 10 MiB of memory.
+/// Minimum number of key_IDs that the file remembers: some 16 MiB in two files, and 10 MiB of memory.
 const IN_FILE: usize = 262_144;
-/// Key_IDs that are written once the file can be written again.
+/// Maximum number of key_IDs that wait to be written until the file can be written again.
 const UNWRITTEN: usize = 65_536;
 /// Time between two tries to open the file of a daemon that has not ended yet.
 const RETRY_INTERVAL: Duration = Duration::from_secs(1);
@@ -29,9 +29,9 @@ struct Used {
     /// All key_IDs since the start, even if the file is lost.
     memory: Ledger,
     unwritten: VecDeque<String>,
-    /// Why the file is not kept.
+    /// The reason why the file is not kept.
     trouble: Option<String>,
-    /// When it was last tried to open it, while another process has it.
+    /// The time of the last attempt to open the file, while another process has it.
     tried: Option<Instant>,
 }
 
@@ -42,7 +42,7 @@ pub struct UsedStatistics {
     pub file: Option<String>,
     /// Key_IDs that are remembered.
     pub key_ids: usize,
-    /// Why the file is not kept: then the record ends with the daemon.
+    /// The reason why the file is not kept: then the record ends with the daemon.
     pub trouble: Option<String>,
 }
 

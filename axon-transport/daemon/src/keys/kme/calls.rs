@@ -38,7 +38,7 @@ impl KmeCaller {
     /// Runs `request` and records how it went.
     pub(super) async fn run(&self, request: &KmeRequest) -> Result<Fetched, RequestFailure> {
         let start = Instant::now();
-        // The client keeps to AXON_KME_ANSWER_TIMEOUT by itself.
+        // The client itself enforces AXON_KME_ANSWER_TIMEOUT.
         let outcome = call(&self.client, request).await;
         let (outcome, repeated) = match (request, outcome) {
             (KmeRequest::Enc { purpose, .. }, Ok(Fetched::Keys(keys))) => {

@@ -32,7 +32,7 @@ pub use statistics::{CallStatistics, Statistics};
 
 use calls::KmeCaller;
 
-/// Requests that wait, for links and for messages each.
+/// Maximum number of requests that wait, for links and for messages separately.
 const QUEUE: usize = 256;
 /// Calls in flight for links: 16 for handshakes that come in, 8 for dials, and room for proofs.
 const LINK_CALLS: usize = 32;
@@ -65,18 +65,18 @@ pub struct KmeAnswer {
     pub answer: Answer,
 }
 
-/// Why the KME cannot even be asked.
+/// The reason why the KME client cannot be made.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum KmeError {
     /// A file cannot be read.
     #[error("{variable}={path}: {reason}")]
     File {
-        /// The variable that names it.
+        /// The variable that names the file.
         variable: &'static str,
         /// The path.
         path: String,
-        /// Why.
+        /// The reason.
         reason: String,
     },
     /// A setting is unusable.
@@ -99,7 +99,7 @@ struct KmeShared {
     messages: mpsc::Sender<Job>,
 }
 
-/// Gives the answers.
+/// The receiver of the answers.
 pub struct Events(mpsc::Receiver<KmeAnswer>);
 
 struct Job {

@@ -9,8 +9,8 @@ use crate::keys::request::{FailureKind, KeyPurpose, KmeRequest, RequestFailure};
 
 /// Time between two lines about one call and SAE: a KME that comes and goes is not worth more.
 const LOG_INTERVAL: Duration = Duration::from_secs(10);
-/// `dec_keys` calls in a row that are refused before that is worth a line: a peer names keys again
-/// that its KME gave away, and KMEs relay keys late.
+/// Number of refused `dec_keys` calls in a row before a line is logged. A peer may name keys again that its KME gave
+/// away, and KMEs relay keys late.
 const REFUSED: u64 = 20;
 /// Calls and SAEs that are watched.
 const MAX: usize = 512;
@@ -59,7 +59,7 @@ impl Outages {
         let key = (call, peer.clone());
         let Some(failure) = failure else { return self.works(now, &key) };
         let refused = call == "dec_keys" && failure.kind == FailureKind::Refused;
-        // Names that a stranger made up are nothing of the KME's.
+        // A refusal of key names that a stranger invented is no failure of the KME.
         if refused && matches!(request, KmeRequest::Dec { purpose: KeyPurpose::Accept, .. })
             || failure.kind == FailureKind::Busy
             || self.watched.len() >= MAX && !self.watched.contains_key(&key)

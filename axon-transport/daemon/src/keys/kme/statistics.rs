@@ -10,7 +10,7 @@ use serde::Serialize;
 
 use crate::keys::request::{FailureKind, Fetched, KeyPurpose, KmeRequest, RequestFailure};
 
-/// Peers whose stock is shown.
+/// Maximum number of peers whose stock is shown.
 const MAX_PEERS: usize = 256;
 
 /// Counters of the KME's calls and answers since the start.
@@ -23,9 +23,9 @@ pub struct Statistics {
     pub dec_keys: CallStatistics,
     /// Calls of `status`.
     pub status: CallStatistics,
-    /// Keys fetched to dial with.
+    /// Keys fetched for dials.
     pub keys_bootstrap: u64,
-    /// Keys fetched for handshakes that came in.
+    /// Keys fetched for incoming handshakes.
     pub keys_accept: u64,
     /// Keys fetched for the proof of a client's name.
     pub keys_proof: u64,
@@ -39,11 +39,11 @@ pub struct Statistics {
     pub last_failure: Option<String>,
 }
 
-/// One kind of call.
+/// Statistics of one kind of call.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 #[non_exhaustive]
 pub struct CallStatistics {
-    /// Made.
+    /// Number of calls.
     pub calls: u64,
     /// Number of these calls that failed.
     pub failures: u64,

@@ -230,7 +230,7 @@ async fn silent_kme_is_given_up_after_the_answer_limit_of_the_settings() {
         let mut settings = settings.clone();
         settings.kme_answer_timeout = limit;
         let (kme, mut events) = Kme::start(&settings, UsedKeys::in_memory()).unwrap();
-        // There is a connection: time would pass while one is made.
+        // The client has a connection already, so that the test's time does not pass while one is made.
         kme.probe("sae-b").await.unwrap();
         sim.inject(Fault::Silence, 1);
         tokio::time::pause();
@@ -291,7 +291,7 @@ async fn keys_that_come_again_after_a_restart_are_not_given_out() {
         let (kme, mut events) = start();
         kme.submit(RequestOrigin::Sender(0), enc(number)).unwrap();
         let outcome = events.recv().await.unwrap().answer.outcome;
-        // The file is let go with the last of it.
+        // Dropping the last reference releases the file.
         drop(kme);
         assert!(events.recv().await.is_none());
         match outcome {
@@ -310,7 +310,8 @@ async fn keys_that_come_again_after_a_restart_are_not_given_out() {
     assert!(!rest.iter().any(|key_id| first.contains(key_id)));
 }
 
-/// A daemon that waits for a pipe's writer never starts; a file without end takes all memory.
+/// Without this check a daemon that waits for a pipe's writer would never start, and a file without end would take all
+/// memory.
 #[tokio::test]
 async fn files_that_are_no_such_files_are_refused_at_once() {
     use std::os::unix::fs::PermissionsExt;
