@@ -1,4 +1,4 @@
-//! KMEs that misbehave: each fault gives its own error, and says honestly what became of the keys.
+//! Tests KMEs that misbehave: each fault gives its own error, which states truthfully whether keys may be lost.
 
 use std::time::Duration;
 
@@ -132,7 +132,7 @@ async fn the_default_size_is_the_one_that_the_last_status_named() {
     let network = network().await;
     let client = once(&network).build().unwrap();
     kme_a(&network).inject(Fault::WrongLength, 1);
-    // Nobody has said yet what the size is.
+    // No call has fixed the size of keys yet.
     client.enc_keys("sae-b").send().await.unwrap();
     client.status("sae-b").await.unwrap();
     kme_a(&network).inject(Fault::WrongLength, 1);

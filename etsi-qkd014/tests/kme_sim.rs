@@ -152,7 +152,7 @@ fn init_replaces_no_file_unless_it_is_told_to() {
     assert_eq!(std::fs::read(beside.join("notes.txt")).unwrap(), b"theirs");
 }
 
-/// What clients in the field send, which the specification does not list and does not forbid.
+/// The requests are of clients in the field; the specification neither lists nor forbids them.
 #[tokio::test]
 async fn the_program_is_lenient_unless_it_is_told_to_be_strict() {
     let head = "POST /api/v1/keys/sae-b/enc_keys HTTP/1.1\r\nHost: x\r\n\

@@ -18,7 +18,7 @@ fn child_path() -> Option<PathBuf> {
     std::env::var_os(PATH).map(PathBuf::from)
 }
 
-/// This test binary again, with one test, behind `prelude` of a shell.
+/// Returns a command that runs one test of this test binary, after the shell commands in `prelude`.
 fn child(test: &str, ledger: &Path, prelude: &str) -> Command {
     let mut command = Command::new("sh");
     command
@@ -149,7 +149,7 @@ fn the_ledger_of_a_killed_process_holds_all_reported_keys() {
         let mut told = lines.map_while(Result::ok).filter_map(|line| line.parse::<usize>().ok());
         let last = told.by_ref().take(200).last();
         killed.kill().unwrap();
-        // What it said before it died counts too.
+        // Numbers that the child printed before it died count too.
         told.last().or(last).unwrap()
     };
     killed.wait().unwrap();
@@ -164,7 +164,7 @@ fn child_that_is_killed() {
     let ledger = Ledger::file(&path).unwrap();
     for n in 0..1_000_000 {
         assert_eq!(record(&ledger, n, 1).unwrap(), [true]);
-        // To the pipe, past the test harness's own buffer.
+        // Writes directly to the pipe, past the test harness's own buffer.
         use std::io::Write;
         writeln!(std::io::stdout(), "{n}").unwrap();
     }

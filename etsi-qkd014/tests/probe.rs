@@ -21,7 +21,7 @@ async fn site() -> Site {
     Site { network, dir }
 }
 
-/// Whether the probe said that all passed, and its table.
+/// Runs the probe. Returns whether it reported success, and its table.
 fn probe(env: &[(&str, String)], args: &[&str]) -> (bool, String) {
     let probed = probing::probe(env, args);
     (probed.passed, probed.text)

@@ -1,6 +1,6 @@
-//! Which check of `kme-sim probe` sees which fault: a simulated KME with each of its faults, and the
-//! KME in Python with a member bent or a door left open. Each check is shown to fail by one of them,
-//! and nothing fails beside what the tables say.
+//! Tests which check of `kme-sim probe` detects which fault. The KMEs are a simulated one with each of its faults, and
+//! the one in Python with a changed member or a missing check. Each check fails for at least one of them, and no check
+//! fails beside those in the tables.
 
 mod probing;
 mod python;
@@ -12,7 +12,7 @@ use etsi_qkd014::sim::{Fault, Layout, Network, Pki, Site};
 use probing::{Env, Probed, env_file, probe};
 use python::Server;
 
-/// How the rows begin that fail, or are only tolerated.
+/// The beginnings of the rows that fail, or are only tolerated.
 type Rows = &'static [&'static str];
 
 const CERTIFICATE: &str = "certificate of the CA given";
@@ -45,7 +45,7 @@ const SAME_BY_GET: &str = "dec_keys by GET: the same key";
 const SAME_BY_POST: &str = "dec_keys by POST: the same 3 keys";
 const AGAIN: &str = "dec_keys of the same key again";
 
-/// What stands on the answer to a request that no key is given to.
+/// The rows that depend on the answer to a request for which no key is given.
 const NOTHING_ANSWERED: Rows = &[
     ANSWERED,
     ACCEPTED,
@@ -56,7 +56,7 @@ const NOTHING_ANSWERED: Rows = &[
     OTHER_TYPE,
 ];
 
-/// The same where each answer is a refusal, of which some may have any code.
+/// The same rows if each answer is a refusal, some of which may have any code.
 const NOTHING_SERVED: Rows =
     &[ANSWERED, ACCEPTED, UNKNOWN_BY_POST, UNKNOWN_BY_GET, BROKEN_JSON, OTHER_TYPE];
 
@@ -66,7 +66,7 @@ const FAULTS: [(&str, Rows); 43] = [
     ("handshake-dropped", &[CERTIFICATE]),
     ("certificate-expired", &[CERTIFICATE]),
     ("certificate-not-yet-valid", &[CERTIFICATE]),
-    // Nothing comes of a KME that does not answer in time.
+    // The probe ends its checks at a KME that does not answer in time.
     ("silence", &[CERTIFICATE]),
     ("latency=60000", &[CERTIFICATE]),
     ("latency=20", &[]),
@@ -283,7 +283,7 @@ async fn refusals_with_any_unspecified_status_code_are_noted() {
         let status = simulated(&format!("status={code},on=status")).await;
         assert!(status.with("note").iter().any(|row| row.starts_with(STATUS_OF_NOBODY)));
     }
-    // Its status is intact, so that its limits are known and tried.
+    // The KME's status is intact, so its limits are known and tested.
     let probed = simulated("status=404,on=enc_keys").await;
     let noted = probed.with("note");
     for row in [NUMBER, SIZE, SLAVES, KEYS_FOR_NOBODY] {

@@ -115,7 +115,7 @@ async fn a_stranger_is_refused_in_the_handshake() {
     let error = pair.client_with("sae-a", "kme-a", other.path()).status("sae-b").await.unwrap_err();
     assert!(matches!(error, Error::Tls { refused_by: RefusedBy::Kme, .. }), "{error}");
 
-    // And the KME is refused that is not the one asked for.
+    // The client refuses a KME with another id than the requested one.
     let wrong = Client::builder()
         .kme_url(pair.server.url("kme-a"))
         .kme_id("kme-b")
@@ -140,7 +140,7 @@ async fn keys_go_both_ways_by_get_and_by_post() {
     assert_eq!((status.stored_key_count, status.max_key_count), (1000, 100_000));
     assert_eq!((status.max_key_per_request, status.max_sae_id_count), (128, 2));
 
-    // Nothing set: one key of the KME's default size.
+    // Without settings, the client gets one key of the KME's default size.
     for via_get in [false, true] {
         let request = master.enc_keys("sae-b");
         let request = if via_get { request.via_get() } else { request };

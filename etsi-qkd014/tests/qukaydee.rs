@@ -11,7 +11,7 @@ use std::path::PathBuf;
 use etsi_qkd014::sim::{Layout, Network, Pki, Site};
 use etsi_qkd014::{Client, Error, KeyContainer};
 
-/// What the variables say.
+/// The values of the variables.
 #[derive(Debug)]
 struct Account {
     id: String,

@@ -1,4 +1,4 @@
-//! Who may ask a simulated KME for what: each SAE against each KME, and each key against each SAE.
+//! Tests the rights of clients at a simulated KME: each SAE against each KME, and each key against each SAE.
 
 mod raw;
 
@@ -52,7 +52,7 @@ async fn a_kme_serves_its_own_saes_only() {
             }
         }
     }
-    // Certificates of the CA with the names of nobody, or of nobody here.
+    // These certificates of the CA have names that belong to no SAE, or to none of this KME.
     let before: Vec<_> = network.kmes().iter().map(|kme| kme.counters().keys_to_masters).collect();
     for name in ["sae-x", "SAE-A", "sae-a.", "sae", "kme-a", "sae-a,sae-b", "*", "sae-a\u{0}", " "]
     {

@@ -1,5 +1,5 @@
-//! The binary under connections that never say who they are, by the thousand, and under clients that
-//! leave while it is at fault.
+//! Tests the binary under thousands of connections that do not authenticate, and under clients that leave while it has
+//! a fault.
 
 #![cfg(target_os = "linux")]
 
@@ -102,7 +102,7 @@ async fn strangers_shut_nobody_out(limits: &str, floods: usize) {
     let before = run.memory();
 
     let floods: Vec<_> = (0..floods).map(|_| std::thread::spawn(move || flood(addr))).collect();
-    // Who is known is served all along.
+    // A known client is served all the time.
     let mut asked = 0;
     while floods.iter().any(|flood| !flood.is_finished()) || asked == 0 {
         known.status("sae-b").await.unwrap();
@@ -128,7 +128,7 @@ async fn more_strangers_than_places_lock_out_no_known_client() {
     strangers_shut_nobody_out("", PLACES.div_ceil(CONNECTIONS)).await;
 }
 
-/// Were it not for those that give way, the last of them would wait for ten handshakes to time out.
+/// Without the connections that give way, the last stranger would wait until ten handshakes time out.
 #[tokio::test]
 #[ignore = "ten thousand connections: cargo test -p etsi-qkd014 --test sim_connections -- --ignored"]
 async fn ten_thousand_strangers_lock_out_no_known_client() {

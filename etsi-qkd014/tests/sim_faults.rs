@@ -21,7 +21,7 @@ fn client(network: &Network, sae: &str) -> Client {
     network.client_builder(sae).retry(RetryPolicy::none()).build().unwrap()
 }
 
-/// The certificates out of their time, and what the client says of each.
+/// The certificates outside their validity, and the client's error for each.
 const CERTIFICATES: [(Fault, &str); 2] = [
     (Fault::CertificateExpired, "the KME's certificate has expired"),
     (Fault::CertificateNotYetValid, "the KME's certificate is not valid yet; check this machine's"),
@@ -50,7 +50,7 @@ async fn certificates_out_of_their_time_are_refused_until_the_fault_is_over() {
             assert_eq!(kme.counters(), before, "nothing was asked of it");
             assert!(kme.plans().is_empty());
             client.enc_keys("sae-b").send().await.unwrap();
-            // Who is connected already stays so.
+            // Existing connections stay.
             kme.inject(fault, 1);
             client.status("sae-b").await.unwrap();
             kme.clear_faults();
@@ -114,7 +114,7 @@ async fn repeated_key_id_is_found_by_the_ledger() {
     let ledger = Ledger::memory(1000);
     let draw = async |number| master.enc_keys("sae-b").number(number).send().await.unwrap().keys;
 
-    // Nothing was handed out before: nothing to repeat.
+    // No key was given out before, so there is none to repeat.
     kme.inject(Fault::ReuseKeyId, 1);
     let first = draw(2).await;
     assert!(ledger.record(first.iter().map(|key| key.key_id())).unwrap() == [true, true]);
@@ -169,7 +169,7 @@ async fn a_pool_hands_out_no_key_id_twice_however_often_the_kme_does() {
             }
         }
         assert!(here.len() == if batch == 1 { 1 } else { 12 });
-        // What was handed out is in the ledger; so is what came again.
+        // The ledger contains all keys that were given out, and keys that came again.
         assert!(ledger.record(&here).unwrap().iter().all(|is_new| !is_new));
         unusable += pool.status().unusable;
         taken.extend(here);

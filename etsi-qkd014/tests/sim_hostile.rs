@@ -124,7 +124,7 @@ async fn bodies_in_chunks_that_are_too_large_or_ambiguous_are_refused_in_words()
         let message = answer.body["message"].as_str().unwrap_or_default();
         assert!(message.contains(word), "{start}: {message}");
     }
-    // What has no end is no request.
+    // A body without an end is not a request.
     for body in ["", "2", "2\r\n{", "2\r\n{}\r\n", "2\r\n{}\r\n0\r\n"] {
         let mut connection = raw::connect(&network, "sae-a").await;
         connection.send(&chunks(body)).await.unwrap();
@@ -200,7 +200,7 @@ async fn other_methods_and_resources_are_refused() {
         connection.send(&request).await.unwrap();
         let answer = connection.answer().await.unwrap();
         assert_eq!(answer.status, status, "{method} {path}");
-        // What follows an answer to HEAD would be read as another's.
+        // Bytes after an answer to HEAD would be read as another answer.
         assert_eq!(method == "HEAD", answer.head.contains("Connection: close"), "{method}");
     }
     assert_eq!(network.kme("kme-a").unwrap().counters().keys_to_masters, 0);
@@ -249,7 +249,7 @@ async fn pipelined_requests_are_answered_in_their_order() {
             assert_eq!(answer.body["keys"].as_array().unwrap().len(), expected);
         }
     }
-    // Nothing is served behind the request that ends the connection.
+    // Requests after the one that ends the connection are not served.
     let last = get("sae-b/status").replace("Host: x", "Host: x\r\nConnection: close");
     connection.send(&(last + &get("sae-b/enc_keys").repeat(3))).await.unwrap();
     assert_eq!(connection.answer().await.unwrap().status, 200);

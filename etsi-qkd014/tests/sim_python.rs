@@ -16,7 +16,7 @@ async fn network() -> Network {
         .unwrap()
 }
 
-/// Lets `sae.py` walk through the network; what it says, or `None` without Python.
+/// Runs `sae.py` through the network. Returns its output, or `None` without Python.
 async fn walk(network: &Network) -> Option<Result<String, String>> {
     let dir = tempfile::tempdir().unwrap();
     network.write_files(dir.path()).unwrap();

@@ -73,7 +73,7 @@ async fn of_batches_that_overlap_each_is_given_whole_or_not_at_all() {
         }
     }
     assert!(!given.is_empty());
-    // What nobody got is still there.
+    // Keys that no caller got are still in the store.
     let slave = client(&network, "sae-b");
     for key in &drawn {
         let same = match given.remove(key.key_id()) {

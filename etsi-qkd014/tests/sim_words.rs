@@ -214,7 +214,7 @@ async fn an_empty_body_asks_for_the_default_unless_the_kme_is_strict() {
     for request in [
         raw::post("sae-b/enc_keys", ""),
         chunked("sae-b/enc_keys", &[]),
-        // As `curl -X POST` sends it: what is not there has no type either.
+        // This is a request of `curl -X POST`: without a body there is no content type either.
         bare("sae-b/enc_keys", ""),
         bare("sae-b/enc_keys", "Content-Length: 0\r\n"),
     ] {
@@ -318,7 +318,7 @@ async fn extensions_of_status_and_keys_reach_the_client() {
     let request = client.enc_keys("sae-b").number(2);
     let container = request.extension_mandatory(direct.clone()).send().await.unwrap();
     assert!(container.keys.iter().all(|key| key.extension() == Some(&direct)));
-    // What is only preferred is not refused, and the answer says what it is instead.
+    // A preference that cannot be met is not refused; the answer states the actual value.
     let preferred = json!({"kme_sim_route_type": "indirect"});
     let request = client.enc_keys("sae-b").extension_optional(preferred);
     assert_eq!(request.send().await.unwrap().into_single().extension(), Some(&direct));

@@ -1,5 +1,5 @@
-//! What the client does below HTTP and just above it: private keys of each form, key exchange,
-//! trust, proxies, redirects, and the bytes of a request, seen from a server of the test's own.
+//! Tests the client's behaviour below HTTP and just above it: private keys of each form, key exchange, trust, proxies,
+//! redirects, and the bytes of a request, as a server of the test sees them.
 
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpListener};
@@ -46,7 +46,7 @@ impl Material {
     }
 }
 
-/// What the server saw of one connection, and of its first request.
+/// The server's record of one connection, and of its first request.
 struct Seen {
     group: Option<NamedGroup>,
     client_certificates: usize,

@@ -109,7 +109,7 @@ async fn a_compressed_body_is_not_asked_for_and_not_taken() {
     assert!(server.heads()[0].contains("\r\naccept-encoding: identity\r\n"));
 }
 
-/// Clause 5.1: UTF-8. RFC 8259 defines no parameter `charset`, so what it says counts for nothing.
+/// Clause 5.1: UTF-8. RFC 8259 defines no parameter `charset`, so its value is ignored.
 #[tokio::test]
 async fn a_body_is_utf_8_regardless_of_its_charset_label() {
     for label in ["; charset=utf-8", ";charset=\"UTF-8\"", "; charset=iso-8859-1", " ; x=y"] {

@@ -84,7 +84,7 @@ async fn times_without_end_are_no_panic() {
         builder.timeout(Duration::MAX).deadline(Duration::MAX).connect_timeout(Duration::MAX)
     };
     endless().build().unwrap().enc_keys("sae-b").send().await.unwrap();
-    // An hour is within such a deadline: the call waits, as it was told to.
+    // An hour is within this deadline: the call waits, as the KME asked.
     network.kme("kme-a").unwrap().inject(Fault::Busy(u64::MAX), 1);
     let client = endless().build().unwrap();
     let waiting = tokio::time::timeout(Duration::from_millis(300), client.status("sae-b")).await;

@@ -32,7 +32,7 @@ pub(crate) fn ok(body: &[u8]) -> Vec<u8> {
     answer("200 OK", "Content-Type: application/json\r\n", body)
 }
 
-/// What the server does after it has sent the answer.
+/// The action of the server after its answer.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Then {
     /// Waits for the next request.

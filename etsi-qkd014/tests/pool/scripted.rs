@@ -1,4 +1,4 @@
-//! A KME whose status and key_IDs a test chooses, for what no honest KME says. Real TLS.
+//! A KME whose status and key_IDs a test chooses, for answers that no honest KME gives. It uses real TLS.
 
 use std::net::SocketAddr;
 use std::path::Path;
@@ -16,7 +16,7 @@ use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::net::{TcpListener, TcpStream};
 use tokio_rustls::TlsAcceptor;
 
-/// What it says.
+/// The answers of the KME.
 pub(crate) struct Script {
     /// `stored_key_count` and `max_key_per_request` of its status.
     pub(crate) stock: (u64, u64),

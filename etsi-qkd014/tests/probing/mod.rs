@@ -5,7 +5,7 @@
 use std::path::Path;
 use std::process::Command;
 
-/// What the probe printed, and whether its exit status said that all passed.
+/// The output of the probe, and whether its exit status reported success.
 pub(crate) struct Probed {
     pub(crate) passed: bool,
     pub(crate) text: String,
@@ -19,7 +19,7 @@ pub(crate) struct Row {
     pub(crate) verdict: String,
 }
 
-/// The variables that say who the probe is.
+/// The variables that give the probe its identity.
 pub(crate) type Env = Vec<(&'static str, String)>;
 
 pub(crate) fn probe(env: &[(&str, String)], args: &[&str]) -> Probed {
@@ -62,7 +62,7 @@ impl Probed {
         lines.take_while(|line| !line.contains(" passed, ")).filter_map(row).collect()
     }
 
-    /// What was expected in the rows with a verdict that begins so.
+    /// Returns the expectations of the rows whose verdict begins with `verdict`.
     pub(crate) fn with(&self, verdict: &str) -> Vec<String> {
         let rows = self.rows().into_iter().filter(|row| row.verdict.starts_with(verdict));
         rows.map(|row| row.expected).collect()

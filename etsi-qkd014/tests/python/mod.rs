@@ -16,7 +16,7 @@ fn python() -> Option<Command> {
     match found {
         Ok(output) if output.status.success() => {
             let mut command = Command::new("python3");
-            // Nothing is written beside the sources.
+            // Python writes no bytecode beside the sources.
             command.arg("-B").current_dir(DIR);
             Some(command)
         }

@@ -21,7 +21,7 @@ pub(crate) async fn connect(network: &Network, sae: &str) -> Connection {
     open(&connector(sae), addr).await.unwrap()
 }
 
-/// What an SAE's certificate and CA make of a connection.
+/// Returns a TLS connector with an SAE's certificate and CA.
 pub(crate) fn connector(sae: &Sae) -> TlsConnector {
     with_pair(sae.ca_pem(), sae.cert_pem(), sae.key_pem())
 }

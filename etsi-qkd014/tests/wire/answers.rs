@@ -1,5 +1,5 @@
-//! Whole HTTP answers that no KME should give. Each fails the call, says honestly what became of the
-//! keys, and tells nothing of a key.
+//! Tests whole HTTP answers that no KME should give. Each fails the call. The error states truthfully whether keys may
+//! be lost, and reveals no key.
 
 use etsi_qkd014::{Error, KeyContainer, Quirks};
 use serde_json::{Value, json};

@@ -52,7 +52,7 @@ async fn escapes_in_a_key_id_are_decoded_before_validation() {
     {
         let body = with(&format!("{cut}{last}"));
         refused(&body).await;
-        // Not as a key_ID of any form either.
+        // The quirk for other forms of key_IDs does not accept these either.
         assert!(enc(&body, Quirks::ANY_KEY_ID).await.is_err(), "{body}");
     }
 }

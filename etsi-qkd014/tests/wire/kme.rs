@@ -1,7 +1,7 @@
-//! A KME whose answers are a test's: wiremock, which speaks plain HTTP, behind mutual TLS.
+//! A KME whose answers a test chooses: wiremock, which speaks plain HTTP, behind mutual TLS.
 //!
-//! The client has no way to speak plain HTTP, not for a test either. The mock is behind a port that
-//! ends TLS as a KME does: with a KME's certificate, and only for an SAE of the same CA.
+//! The client cannot speak plain HTTP, not even for a test. The mock is behind a port that ends TLS as a KME does: with
+//! a KME's certificate, and only for an SAE of the same CA.
 
 use std::net::SocketAddr;
 use std::sync::Arc;

@@ -1,5 +1,5 @@
-//! What this client sends: method, path, query, body and headers of each call. A request that differs
-//! is answered 404, and the call fails.
+//! Tests the requests of this client: method, path, query, body and headers of each call. The mock answers a request
+//! that differs with 404, and the call fails.
 
 use std::time::Duration;
 
