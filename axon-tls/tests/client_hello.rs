@@ -1,4 +1,4 @@
-//! What is on the wire: the ClientHello of every mode, taken from records and packets and parsed here.
+//! Tests the ClientHello on the wire in every mode, taken from records and packets and parsed here.
 #![cfg(all(feature = "hybrid", feature = "quic"))]
 
 mod common;

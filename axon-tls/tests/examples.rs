@@ -1,4 +1,4 @@
-//! The examples run, and what they say of themselves is asserted in them.
+//! Runs the examples, which assert their own claims.
 #![cfg(all(feature = "hybrid", feature = "quic", feature = "tokio"))]
 
 #[path = "../examples/http3.rs"]

@@ -181,7 +181,7 @@ impl ResolvesExternalPsk for OneKey {
     }
 }
 
-/// What a server demands of a second ClientHello is what foreign clients do.
+/// Foreign clients fulfil a server's requirements for a second ClientHello.
 #[test]
 fn foreign_clients_get_through_a_hello_retry_request() {
     let (identity, secret) = vector(Cipher::ChaCha20Poly1305);

@@ -11,7 +11,7 @@ use axon_tls::{Cipher, PskKex, hybrid, qkd};
 use peers::psk::{our_client, our_server, psk};
 use peers::{Peer, dial, file, gnutls, handshake, listen, openssls, patient, port};
 
-/// How a peer is told to have one classical way alone: for OpenSSL, and for GnuTLS.
+/// The arguments that make a peer offer only one classical way: for OpenSSL, and for GnuTLS.
 const CLASSICAL: [([&str; 3], &str); 3] = [
     (["-tls1_3", "-groups", "X25519"], "NORMAL:-VERS-ALL:+VERS-TLS1.3:-GROUP-ALL:+GROUP-X25519"),
     (["-tls1_3", "-groups", "P-256"], "NORMAL:-VERS-ALL:+VERS-TLS1.3:-GROUP-ALL:+GROUP-SECP256R1"),
@@ -57,7 +57,7 @@ fn classical_clients_are_refused() {
     }
 }
 
-/// The same servers accept a stock rustls client, so what is refused is what they offer.
+/// The same servers accept a stock rustls client, so our client refuses them because of their offer.
 #[test]
 fn classical_servers_are_refused() {
     let certified = rcgen::generate_simple_self_signed(["peer".to_owned()]).unwrap();

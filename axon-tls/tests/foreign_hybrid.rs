@@ -88,7 +88,7 @@ fn our_client(auth: &Auth, cipher: Cipher) -> ClientConnection {
     ClientConnection::new(Arc::new(config), "peer".try_into().unwrap()).unwrap()
 }
 
-/// The outcome of our client with their server; what works says the same on both ends.
+/// Returns the outcome of our client with their server. A success must be the same on both ends.
 fn dialled(
     program: &str,
     auth: &Auth,

@@ -75,7 +75,7 @@ impl Ca {
         CaMaterial::from_pem(&self.pem, &host.cert, &host.key, crl).unwrap()
     }
 
-    /// Of a protocol in which both ends say who they are.
+    /// Returns the credentials for a protocol in which both ends state their names.
     fn auth(&self, host: &Host, crl: Option<&str>) -> Auth {
         Auth::Ca(Arc::new(self.material(host, crl).with_names_checked_by_application()))
     }
@@ -111,7 +111,7 @@ fn handshake(client: &Auth, server: &Auth) -> Result<(), rustls::Error> {
     Ok(())
 }
 
-/// What both directions say: `peer` as the server, and as the client.
+/// Returns the results of both directions: with `peer` as the server, and as the client.
 fn both(us: &Auth, peer: &Auth) -> [Result<(), String>; 2] {
     [handshake(us, peer), handshake(peer, us)].map(|r| r.map_err(|error| format!("{error:?}")))
 }
@@ -130,7 +130,7 @@ fn a_stranger_is_refused_in_both_directions() {
     let stranger = other.host(&["b"], &[], 2);
     // it trusts our CA, so only we can refuse
     let peer = ca.auth(&stranger, None);
-    // the two CAs have the same name, so what tells them apart is the signature
+    // the two CAs have the same name, so only the signature distinguishes them
     refused_for(&us, &peer, "BadSignature");
 }
 

@@ -50,13 +50,13 @@ fn signs(pem: &str) -> Arc<dyn rustls::sign::SigningKey> {
     any_supported_type(&PrivateKeyDer::Pkcs8(der)).unwrap()
 }
 
-/// One of `us` and one that shows `chain`, in both roles: what our side says.
+/// Connects `us` with a peer that shows `chain`, in both roles. Returns whether our side accepts.
 fn meet(us: &Auth, chain: &[Vec<u8>], key: &Arc<dyn rustls::sign::SigningKey>) -> [bool; 2] {
     let raw = !matches!(us, Auth::Ca(_));
     let chain = chain.iter().map(|der| CertificateDer::from(der.clone())).collect();
     let certified = Arc::new(CertifiedKey::new(chain, Arc::clone(key)));
     let shows = Arc::new(Shows { certified, raw });
-    // Its own configuration is one of ours, but for what it shows.
+    // The peer's configuration is one of ours, except for what it shows.
     let anybody = Auth::None(SigningKey::generate().unwrap());
     let base = if raw { &anybody } else { us };
     let cipher = Cipher::default();
@@ -75,7 +75,7 @@ fn meet(us: &Auth, chain: &[Vec<u8>], key: &Arc<dyn rustls::sign::SigningKey>) -
     [accepts(dialling.into(), server.into()), accepts(answering.into(), client.into())]
 }
 
-/// Whether `us` finishes the handshake.
+/// Returns whether `us` finishes the handshake.
 fn accepts(mut us: Connection, mut peer: Connection) -> bool {
     for _ in 0..6 {
         for _ in 0..2 {

@@ -195,7 +195,7 @@ fn unusable_keys_and_offers_are_refused() {
     assert!(psk_server(table([]), one, PskKex::PskKe, &[b'a'; 256]).is_err());
 }
 
-/// What passes the check of an offer makes a ClientHello: else quinn would fail without a reason.
+/// An offer that passes the check fits a ClientHello. Otherwise quinn would fail without a reason.
 #[test]
 fn longest_offer_fits() {
     let keys = vec![key(&[1; 59_945], 1, Cipher::Aes256Gcm)];

@@ -1,4 +1,4 @@
-//! Whole QUIC connections in one process: what is refused, and what works.
+//! Tests whole QUIC connections in one process: refused ones, and working ones.
 #![cfg(all(feature = "hybrid", feature = "quic"))]
 
 mod common;
@@ -215,7 +215,7 @@ async fn another_alpn_is_refused() {
     assert!(hybrid_server(&unauthenticated(), cipher, &[b'a'; 256]).is_err());
 }
 
-/// RFC 9001 section 8.1: a client that says nothing about ALPN is refused as one that says another.
+/// RFC 9001 section 8.1: a client without ALPN is refused like one with another ALPN.
 #[tokio::test]
 async fn no_alpn_is_refused() {
     let ca = Authority::new();

@@ -1,5 +1,5 @@
-//! Nothing is sent before the peer is known: neither a client's early data nor a server's data before
-//! the client's Finished, whatever the application or the peer would like.
+//! Tests that nothing is sent before the peer is known: neither a client's early data nor a server's data before the
+//! client's Finished, even if the application or the peer asks for it.
 #![cfg(all(feature = "hybrid", feature = "quic"))]
 
 mod common;
@@ -16,7 +16,7 @@ use common::{OneKey, psk, stock};
 use quinn::{ClientConfig, Endpoint, ServerConfig};
 use quinn_proto::{Dir, Side};
 
-/// Whether the client could send early data on its first and on its second connection.
+/// Returns whether the client could send early data on its first and on its second connection.
 async fn early_data(client: ClientConfig, server: ServerConfig) -> [bool; 2] {
     let localhost = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
     let server = Endpoint::server(server, localhost).unwrap();
@@ -119,8 +119,7 @@ async fn early_data_on_a_ticket_from_elsewhere_is_not_accepted() {
     assert_eq!(data, b"late");
 }
 
-/// Whether a server that has something to say from the first moment on says it before it has the
-/// client's Finished.
+/// Returns whether a server with data to send from the start sends it before it has the client's Finished.
 fn speaks_early(client: ClientConfig, server: ServerConfig) -> bool {
     let mut pair = Pair::new(server);
     pair.dial(client);

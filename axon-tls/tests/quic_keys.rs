@@ -170,7 +170,7 @@ fn both_ends_report_the_key_exchange_only_after_the_handshake() {
     }
 }
 
-/// Changes one byte of what the client or the server says.
+/// Changes one byte in the data of the client or the server.
 struct OneByte {
     of_client: bool,
     at: usize,

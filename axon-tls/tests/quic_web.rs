@@ -94,7 +94,7 @@ async fn certificate_of_another_authority_is_refused() {
     assert!(outcome.client.is_err() && outcome.server.is_err());
 }
 
-/// Connects and sends a byte each way, whatever TLS either end has; what each end made of it.
+/// Connects and sends a byte each way, for any TLS of either end. Returns the result of each end.
 async fn echo(
     client: quinn::ClientConfig,
     server: quinn::ServerConfig,

@@ -1,4 +1,4 @@
-//! What is on the wire: the ServerHello of every mode, over TCP and QUIC.
+//! Tests the ServerHello on the wire in every mode, over TCP and QUIC.
 #![cfg(all(feature = "hybrid", feature = "quic"))]
 
 mod common;
@@ -14,7 +14,7 @@ use common::wire::{CryptoStream, InitialKeys, Kind, packets};
 use common::{OneKey, psk};
 use quinn_proto::Side;
 
-/// What a server answers to a client, up to the end of the first record.
+/// Returns a server's answer to a client, up to the end of the first record.
 macro_rules! over_tcp {
     ($tls:ident, $client:expr, $server:expr) => {{
         let name = "axon".try_into().unwrap();
@@ -59,7 +59,7 @@ fn hybrid_mode() {
     }
 }
 
-/// All that the CRYPTO frames in the server's Initial packets carry, of a handshake that completes.
+/// Returns the data of the CRYPTO frames in the server's Initial packets, from a handshake that completes.
 fn over_quic(client: quinn::ClientConfig, server: quinn::ServerConfig) -> Vec<u8> {
     let mut pair = Pair::new(server);
     let (mut keys, mut crypto) = (None, CryptoStream::default());

@@ -26,12 +26,12 @@ use self::anybody::Anybody;
 
 type Key = Arc<dyn rustls::sign::SigningKey>;
 
-/// What a peer of ours makes its CertificateVerify of.
+/// The parts from which a peer makes its CertificateVerify.
 #[derive(Clone, Debug)]
 struct Forger {
-    /// Whose public key it shows.
+    /// The public key that the peer shows.
     shown: Vec<u8>,
-    /// What it signs with, if it signs at all.
+    /// The key with which the peer signs, if it signs at all.
     key: Option<Key>,
     /// The scheme that it says it has signed in.
     claimed: SignatureScheme,
@@ -124,7 +124,7 @@ fn our_server(auth: &Auth) -> ServerConnection {
     ServerConnection::new(Arc::new(config)).unwrap()
 }
 
-/// What each end makes of the other.
+/// The result of each end.
 struct Outcome {
     client: Result<(), Error>,
     server: Result<(), Error>,

@@ -54,7 +54,7 @@ where
     (near.unwrap(), far.unwrap())
 }
 
-/// What rustls says is wrong, in an error of a stream.
+/// Returns the error of rustls in an error of a stream.
 #[track_caller]
 fn tls_error(err: &std::io::Error) -> &Error {
     assert_eq!(err.kind(), ErrorKind::InvalidData, "{err}");

@@ -1,4 +1,4 @@
-//! Takes any peer for who it says it is, for tests in which that has no part.
+//! Accepts any identity that a peer claims, for tests in which identity does not matter.
 
 use rustls::{
     DigitallySignedStruct, DistinguishedName, Error, SignatureScheme,

@@ -61,8 +61,8 @@ pub(crate) struct ClientHello {
 }
 
 impl ClientHello {
-    /// Has a client dial a server that never hears of it, and reads the ClientHello out of the Initial
-    /// packets: with a group share it takes more than one.
+    /// Makes a client dial a server that never gets the packets, and reads the ClientHello from the Initial packets:
+    /// with a group share it takes more than one.
     pub(crate) fn over_quic(client: quinn::ClientConfig, server: quinn::ServerConfig) -> Self {
         let mut pair = Pair::new(server);
         let mut crypto = CryptoStream::default();

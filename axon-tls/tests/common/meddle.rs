@@ -12,7 +12,7 @@ use quinn_proto::crypto::{
 use quinn_proto::transport_parameters::TransportParameters;
 use quinn_proto::{ConnectionId, Side, TransportError};
 
-/// Who meddles.
+/// A man in the middle, who changes data.
 pub(crate) trait Meddler: Send + 'static {
     /// Changes what the client has written, before the server reads it.
     fn read(&mut self, _bytes: &mut Vec<u8>) {}

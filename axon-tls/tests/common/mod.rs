@@ -56,7 +56,7 @@ impl PskResolver for OneKey {
     }
 }
 
-/// What each end of a connection made of it.
+/// The result of each end of a connection.
 pub(crate) struct Outcome {
     pub(crate) client: Result<Negotiated, ConnectionError>,
     pub(crate) server: Result<Negotiated, ConnectionError>,

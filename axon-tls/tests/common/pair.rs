@@ -22,7 +22,7 @@ pub(crate) struct End {
     pub(crate) conn: Option<(ConnectionHandle, Connection)>,
     /// Datagrams to the other end.
     outbox: VecDeque<Vec<u8>>,
-    /// Whether a server answers addresses that it does not know with a Retry.
+    /// Whether a server answers unknown addresses with a Retry.
     pub(crate) retries: bool,
     /// Whether the handshake was completed, as the connection itself reports.
     pub(crate) connected: bool,
@@ -101,7 +101,7 @@ impl Pair {
         }
     }
 
-    /// Whether both ends completed the handshake and still have their connection.
+    /// Returns whether both ends completed the handshake and still have their connection.
     pub(crate) fn is_up(&self) -> bool {
         [&self.client, &self.server].into_iter().all(|end| end.connected && end.lost.is_none())
     }
@@ -147,7 +147,7 @@ impl End {
         }
     }
 
-    /// Puts what the connection has to say into the outbox; whether there is anything in it.
+    /// Puts the packets of the connection into the outbox. Returns whether the outbox has any.
     fn send(&mut self, now: Instant) -> bool {
         let Some((handle, conn)) = &mut self.conn else { return !self.outbox.is_empty() };
         loop {

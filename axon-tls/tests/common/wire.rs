@@ -31,7 +31,7 @@ impl<'a> Reader<'a> {
     }
 }
 
-/// What a packet of QUIC version 1 is by its first byte.
+/// The type of a packet of QUIC version 1, from its first byte.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Kind {
     Initial,
@@ -90,7 +90,7 @@ pub(crate) fn packets(mut datagram: &[u8]) -> Vec<Packet<'_>> {
     packets
 }
 
-/// What one end protects its Initial packets with (RFC 9001 section 5.2).
+/// The keys with which one end protects its Initial packets (RFC 9001 section 5.2).
 pub(crate) struct InitialKeys {
     pub(crate) key: Vec<u8>,
     pub(crate) iv: Vec<u8>,
@@ -98,7 +98,7 @@ pub(crate) struct InitialKeys {
 }
 
 impl InitialKeys {
-    /// From the connection ID in the client's first packet.
+    /// Derives the client's keys from the connection ID in its first packet.
     pub(crate) fn client(dst_cid: &[u8]) -> Self {
         Self::new(dst_cid, b"client in")
     }
@@ -156,7 +156,7 @@ fn expand_label(secret: &Prk, label: &[u8], len: usize) -> Vec<u8> {
     expanded
 }
 
-/// What CRYPTO frames carry, in pieces that may come in any order and more than once.
+/// The data of CRYPTO frames, in pieces that may come in any order and more than once.
 #[derive(Default)]
 pub(crate) struct CryptoStream(BTreeMap<usize, Vec<u8>>);
 
@@ -185,7 +185,7 @@ impl CryptoStream {
         }
     }
 
-    /// All that has come without a gap before it.
+    /// Returns the bytes up to the first gap.
     pub(crate) fn bytes(&self) -> Vec<u8> {
         let mut bytes: Vec<u8> = Vec::new();
         for (offset, piece) in &self.0 {

@@ -16,7 +16,7 @@ use std::sync::mpsc::{Receiver, channel};
 use std::time::Duration;
 
 const PATIENCE: Duration = Duration::from_secs(30);
-/// What both ends export to see that they have the same secrets.
+/// The label that both ends export to check that they have the same secrets.
 pub(crate) const LABEL: &str = "EXPORTER-axon-test";
 
 /// A process that does not outlive the test, and the lines it prints.
@@ -106,7 +106,7 @@ pub(crate) fn listen() -> (TcpListener, SocketAddr) {
     (listener, addr)
 }
 
-/// What the tests need of a connection, be it of rustls or of rustls-axon.
+/// The functions that the tests need of a connection, of rustls or of rustls-axon.
 pub(crate) trait Tls {
     fn is_handshaking(&self) -> bool;
     fn complete_io(&mut self, socket: &mut TcpStream) -> Result<(), Error>;
@@ -154,7 +154,8 @@ pub(crate) fn handshake(conn: &mut impl Tls, socket: &mut TcpStream) -> Result<(
     Ok(())
 }
 
-/// Both ends export the same, and data goes both ways. An echo server says what it hears.
+/// Checks that both ends export the same secret, and that data goes both ways. An echo server returns the data that it
+/// receives.
 pub(crate) fn exchange(conn: &mut impl Tls, socket: &mut TcpStream, peer: &mut Peer, echoes: bool) {
     let exported: String = conn.export().iter().map(|byte| format!("{byte:02x}")).collect();
     let line = peer.expect("material: ").to_lowercase();
