@@ -1,4 +1,4 @@
-//! `axon acl check` beside daemons that run: what a peer said, and rules that the daemon has not read yet.
+//! Tests `axon acl check` beside running daemons: the answers of a peer, and rules that the daemon has not read yet.
 
 #![forbid(unsafe_code)]
 

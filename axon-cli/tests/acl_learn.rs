@@ -35,7 +35,7 @@ fn meet(publisher: &Publisher, subscription: &Subscription) {
     });
 }
 
-/// Until a sample of the publisher arrives.
+/// Waits until a sample of the publisher arrives.
 fn flows(publisher: &Publisher, subscription: &Subscription) {
     meet(publisher, subscription);
     publisher.publish(b"sample").expect("published");
@@ -89,7 +89,7 @@ impl Hosts {
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     }
 
-    /// What the robot's rules deny the base station.
+    /// Returns whether the robot's rules deny this to the base station.
     fn denied(&self, what: &str) -> bool {
         let status = self.robot.status().expect("a status");
         status["links"]
@@ -118,7 +118,7 @@ fn learned_rules_permit_the_seen_uses_and_no_other() {
     flows(&scan.0, &scan.1);
     let learned = hosts.dir.path().join("learned.toml");
     let (learn, said) = hosts.learn(&["--output", learned.to_str().expect("UTF-8")]);
-    // What comes and goes while it watches.
+    // These endpoints come and go during the watch.
     let briefly = subscription(&here, "/brief");
     let brief = publisher(&there, "/brief");
     meet(&brief, &briefly);
@@ -146,7 +146,7 @@ fn learned_rules_permit_the_seen_uses_and_no_other() {
     let (other, heard) = (publisher(&there, "/other"), subscription(&here, "/other"));
     eventually("one more topic is denied", || hosts.denied("publish /other (the peer's)"));
     assert!(other.matched().is_empty() && heard.matched().is_empty());
-    // The process that waits for what is denied says why.
+    // The process that waits for a denied topic prints the reason.
     let _secret = publisher(&here, "/secret");
     let mut echo = Running::start(hosts.base.axon(&["echo", "/secret", "--type", "test/Bytes"]));
     let said = BufReader::new(echo.0.stderr.take().expect("standard error"));
@@ -155,7 +155,7 @@ fn learned_rules_permit_the_seen_uses_and_no_other() {
     // A new pair of what was seen is made.
     flows(&commands.0, &subscription(&here, "/cmd_vel"));
 
-    // What is denied by rules in force stays so.
+    // Uses that the rules in force deny stay denied.
     let again = hosts.robot.run(&["acl", "learn", "--for", "5s", "--output", file]);
     let said = String::from_utf8_lossy(&again.stderr);
     assert_eq!(again.status.code(), Some(1), "{said}");
@@ -179,7 +179,7 @@ fn acl_learn_reports_a_daemon_exit_and_writes_rules_learned_so_far() {
     let (here, there) = (hosts.robot.session("robot"), hosts.base.session("base"));
     let commands = (publisher(&there, "/cmd_vel"), subscription(&here, "/cmd_vel"));
     flows(&commands.0, &commands.1);
-    // Its output is a pipe that nobody reads any more.
+    // The output of the program is a pipe that is not read any more.
     let (mut deaf, deaf_said) = hosts.learn(&[]);
     drop(deaf.0.stdout.take());
     let (learn, said) = hosts.learn(&["--see"]);
@@ -188,7 +188,7 @@ fn acl_learn_reports_a_daemon_exit_and_writes_rules_learned_so_far() {
         let sessions = status["sessions"].as_array().expect("sessions").iter();
         sessions.filter(|session| session["name"] == "axon acl learn").count() == 2
     });
-    // What they have seen cannot be asked: the graph is there with the session, the names of hosts soon after.
+    // The test cannot ask what they have seen: the graph is there with the session, and the names of hosts soon after.
     std::thread::sleep(Duration::from_secs(2));
     let (output, said_there) = interrupt(deaf, deaf_said);
     assert!(output.status.success(), "{said_there}");

@@ -166,7 +166,7 @@ fn a_quick_run_writes_every_figure_there_is() {
         check_budget(row, check_ratio_median(&row["ratio_to_one"]), at_most);
     }
 
-    // The same in the tables: as many rows as loads, and nothing without its title.
+    // The tables have as many rows as there are loads, and no row without its title.
     assert_eq!(text.matches("\nLatency, ").count(), KINDS.len(), "{text}");
     assert_eq!(text.matches("\nThroughput, ").count(), 3, "{text}");
     assert!(
@@ -252,7 +252,7 @@ fn a_quick_run_of_sessions_compares_them_with_bare_shared_memory() {
         check_times(&row["session"]);
         check_judged(&row["session_to_bare"], 1.3);
         let service = (&row["service_one_way"], &row["service_round_trip_to_session"]);
-        // What is made and read in place has no service beside it, which copies.
+        // Data that is made and read in place has no service row beside it, because a service copies.
         if row["motion"] == "copy" {
             check_times(service.0);
             check_judged(service.1, 2.5);

@@ -16,7 +16,7 @@ use serde_json::Value;
 
 const DIR: &str = "DEMO_KMES_DIR";
 
-/// Not a test of its own: the process of the KMEs, which ends with its standard input.
+/// Not a test of its own: the process of the KMEs, which ends when its standard input ends.
 #[test]
 #[ignore = "started by the other tests"]
 #[allow(clippy::print_stdout, reason = "this is how it speaks to the test")]
@@ -71,7 +71,7 @@ impl Kmes {
         Self { child, said }
     }
 
-    /// Ends it; what it said.
+    /// Ends the process, and returns its output.
     fn end(&mut self) -> String {
         drop(self.child.stdin.take());
         let mut text = String::new();

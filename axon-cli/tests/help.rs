@@ -1,4 +1,4 @@
-//! What `--help` says: each command's purpose, examples, exit statuses.
+//! Tests the output of `--help`: each command's purpose, examples, exit statuses.
 
 #![forbid(unsafe_code)]
 

@@ -36,7 +36,7 @@ fn stop_with(signal: Signal, temporary: &Path) -> Running {
     assert!(processes_with(temporary) > 4, "two daemons, two subscribers and a player");
     let pid = i32::try_from(demo.0.id()).ok().and_then(Pid::from_raw).expect("a process id");
     kill_process(pid, signal).expect("it runs");
-    // What else it says must not fill the pipe.
+    // The rest of its output must not fill the pipe.
     let _ = stderr.count();
     demo
 }

@@ -38,7 +38,7 @@ fn play_of_an_invalid_log_fails_and_names_the_file() {
 #[test]
 fn nothing_that_a_command_says_steers_a_terminal() {
     let host = Host::new();
-    // Of a file's name, and of a setting.
+    // The escapes are in the name of a file, and in a setting.
     let output = host.run(&["play", "/no\u{1b}[2Jne\u{2066}\u{61c}.mcap"]);
     assert_eq!(output.status.code(), Some(1));
     assert!(str::from_utf8(&output.stderr).is_ok(), "UTF-8");
@@ -158,13 +158,13 @@ fn echo_finds_the_type_and_shows_the_message() {
     assert!(echo.finish().status.success());
 }
 
-/// How an `axon echo` ends.
+/// The ends of an `axon echo`.
 #[derive(Clone, Copy, Debug)]
 enum End {
     Signal(Signal),
-    /// Nobody reads what it prints any more.
+    /// Its output is not read any more.
     Unread,
-    /// As many came as were asked for.
+    /// The requested number of messages came.
     Count,
 }
 
@@ -184,7 +184,7 @@ fn assert_echo_says_what_it_missed(end: End) {
     match end {
         End::Signal(signal) => {
             kill_process(pid, Signal::CONT).expect("it runs");
-            // More than the pipe can hold of what was printed before the stop.
+            // The program printed more before the stop than the pipe can hold.
             assert_eq!(lines.by_ref().take(2_000).count(), 2_000);
             kill_process(pid, signal).expect("it runs");
             lines.for_each(drop);
@@ -216,7 +216,7 @@ fn echo_reports_missed_messages_when_ended_by_a_signal_or_hangup() {
     }
 }
 
-/// Whether this process ignores SIGHUP: so do the programs that it starts.
+/// Returns whether this process ignores SIGHUP: then the programs that it starts do as well.
 fn ignores_hangup() -> bool {
     let status = std::fs::read_to_string("/proc/self/status").expect("Linux has it");
     let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:")).expect("a mask");

@@ -10,7 +10,7 @@ use common::{LOG, Stderr, axon};
 const COMMANDS: [&[&str]; 5] =
     [&["demo"], &["play", LOG], &["echo", "/scan"], &["trust", "list"], &["daemon"]];
 
-/// What `axon trust` does before a host is set up, and in order to set it up.
+/// `axon trust` works before a host is set up, because it is part of the setup.
 #[test]
 fn trust_keygen_and_scan_work_under_invalid_settings() {
     let dir = tempfile::tempdir().expect("temporary directory");
@@ -96,7 +96,7 @@ fn a_wrong_argument_has_status_2_too() {
 #[test]
 fn a_standard_error_that_takes_nothing_changes_no_status() {
     let full = || std::fs::OpenOptions::new().write(true).open("/dev/full").expect("Linux has it");
-    // Where no daemon is, whatever else runs on this host.
+    // The directory has no daemon, even if one runs on this host.
     let dir = tempfile::tempdir().expect("temporary directory");
     let mut setting = axon([("AXON_QKD_TYPO", "x")]);
     setting.env("AXON_RUNTIME_DIR", dir.path());

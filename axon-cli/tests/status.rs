@@ -1,5 +1,5 @@
-//! `axon status` where this host's own settings or files are wrong: it says what is wrong with which, as the
-//! daemon would, and shows the daemon all the same if one runs.
+//! Tests `axon status` with wrong settings or files of this host: it reports each error as the daemon would, and still
+//! shows the daemon if one runs.
 
 #![forbid(unsafe_code)]
 
@@ -141,7 +141,7 @@ fn status_reports_wrong_settings_and_a_missing_daemon() {
         assert_eq!(stderr.lines().count(), 2, "{variable}: {stderr}");
         assert_eq!((output.status.code(), output.stdout.len()), (Some(code), 0), "{stderr}");
     }
-    // By it the daemon would be found.
+    // The daemon's address depends on this setting.
     let output = status(&host, &[("ROS_DOMAIN_ID", "-1".to_owned())], &[]);
     let stderr = said(&output, "ROS_DOMAIN_ID", &["-1"]);
     assert_eq!((output.status.code(), stderr.lines().count()), (Some(2), 1), "{stderr}");
@@ -155,7 +155,7 @@ fn a_variable_that_is_no_setting_is_named() {
     let output = status(&host, &[("AXON_EDITOR", "vi".to_owned())], &[]);
     let stderr = said(&output, "AXON_EDITOR", &["ignored", "AXON_STRICT_ENV"]);
     assert!(output.status.success(), "{stderr}");
-    // What speaks of security is no foreign variable.
+    // A variable whose name concerns security does not count as foreign.
     for name in ["AXON_CERTIFICATE", "AXON_PINS", "AXON_ROBOT_IDENTITY"] {
         let output = status(&host, &[(name, "x".to_owned())], &[]);
         let stderr = said(&output, name, &["accepted"]);

@@ -28,7 +28,7 @@ fn utf8(path: &Path) -> &str {
     path.to_str().expect("UTF-8")
 }
 
-/// Runs and fails with `status`, on one line that says `said`, printing nothing else.
+/// Checks that the command fails with `status` and prints only one line, which contains `said`.
 #[track_caller]
 fn refused(args: &[&str], settings: &[(&str, &str)], status: i32, said: &str) {
     let output = trust(args, settings);
@@ -57,7 +57,7 @@ fn a_file_that_exists_is_never_overwritten() {
     refused(&["keygen", utf8(&key)], &[], 1, "exists, and is not overwritten; delete it");
     assert_eq!(fs::read_to_string(&key).expect("still there"), "something dear");
 
-    // What a link leads to is not created either: somebody else may have put the link there.
+    // The target of a link is not created either: another user may have made the link.
     let (link, target) = (dir.path().join("link"), dir.path().join("target"));
     symlink(&target, &link).expect("a link");
     refused(&["keygen", utf8(&link)], &[], 1, utf8(&link));
@@ -67,7 +67,7 @@ fn a_file_that_exists_is_never_overwritten() {
 
 #[test]
 fn a_directory_that_cannot_be_written_is_named() {
-    // Not by permissions, which do not hold for root.
+    // These paths fail without permissions, which do not stop root.
     for (path, said) in [
         ("/proc/axon-host.key", ""),
         ("/nowhere/host.key", "its directory does not exist; make that first"),

@@ -84,7 +84,7 @@ fn scan_prints_the_line_that_keygen_printed() {
         let output = host.run(&["trust", "scan", &at, "--name", "arm-2"]);
         assert_eq!(printed(&output), line.replacen("127.0.0.1 ", "arm-2 ", 1));
 
-        // The daemon linked with nobody, and says that somebody was there.
+        // The daemon linked with no peer, and reports the attempt.
         eventually("a refusal in the daemon's status", || {
             status().is_some_and(|s| s["refusals"].as_array().is_some_and(|r| !r.is_empty()))
         });
@@ -121,7 +121,7 @@ fn a_server_that_is_no_daemon_is_told_from_silence() {
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().expect("tokio");
     let auth = Auth::None(SigningKey::generate().expect("a key"));
     let web = hybrid_server(&auth, Cipher::default(), b"h3").expect("a server");
-    // What most of the world has: a certificate, and X25519 alone.
+    // Most servers have this: a certificate, and only X25519.
     let key = rcgen::KeyPair::generate().expect("a key");
     let params = rcgen::CertificateParams::new(["robot".to_owned()]).expect("a name");
     let certificate = params.self_signed(&key).expect("a certificate").der().clone();

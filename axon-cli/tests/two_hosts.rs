@@ -24,7 +24,7 @@ fn echo_all(host: &Host, qos: &str) -> [Running; 3] {
         .map(|topic| Running::start(host.axon(&["echo", topic, "--qos", qos, "--json"])))
 }
 
-/// The exit status, and what it said.
+/// Returns the exit status and the standard error.
 fn outcome(play: Running) -> (Option<i32>, String) {
     let output = play.finish();
     (output.status.code(), String::from_utf8(output.stderr).expect("UTF-8"))
@@ -100,8 +100,8 @@ fn play_fails_where_the_other_host_takes_nothing_more() {
     assert!(unheard.iter().any(|why| said.contains(why)), "{said}");
 }
 
-/// The next daemon sends what the killed one had. Until it is there the publisher has no subscription, which `play` says,
-/// though these messages arrive too.
+/// The next daemon sends the messages of the killed one. Until it runs the publisher has no subscription. `play`
+/// reports that, although these messages arrive, too.
 #[test]
 fn no_message_is_lost_with_the_daemon_of_play() {
     let [a, b] = Host::pair();
@@ -120,7 +120,7 @@ fn no_message_is_lost_with_the_daemon_of_play() {
     echoes.assert_whole();
 }
 
-/// Nothing is on its way when the other host's subscriptions leave, so that nothing is given up.
+/// No message is in flight when the other host's subscriptions leave, so none is given up.
 #[test]
 fn play_fails_where_the_subscriptions_that_it_waited_for_leave() {
     let [a, b] = Host::pair();

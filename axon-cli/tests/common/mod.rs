@@ -14,7 +14,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-/// What a program wrote to standard error. A failed assertion shows an excerpt of it.
+/// The standard error of a program. A failed assertion shows an excerpt of it.
 pub(crate) struct Stderr(String);
 
 impl Stderr {
@@ -140,7 +140,7 @@ impl Host {
         Some(i32::try_from(pid).expect("a process id"))
     }
 
-    /// The same, once it answers.
+    /// Waits until the daemon answers, and returns its pid.
     pub(crate) fn wait_daemon(&self) -> i32 {
         let mut daemon = None;
         eventually("a daemon answers", || {
