@@ -166,7 +166,7 @@ fn there_is_no_eleventh_message_and_none_after_an_hour() {
     for index in 0..10 {
         let slot = full.slot(START, Delivery::BestEffort).unwrap();
         assert_eq!(slot.index(), index);
-        // That permit was dropped: it has used nothing up.
+        // The dropped permit has used nothing up.
         seal(&mut full, ROUTE, Delivery::BestEffort, PLAINTEXT);
     }
     assert_eq!(full.slot(START, Delivery::Reliable).err(), Some(Spent::Messages));

@@ -1,4 +1,4 @@
-//! How long a key lives: RETIRE, age, count, and a change of connection.
+//! Tests the lifetime of a key: RETIRE, age, count, and a change of connection.
 
 mod common;
 
@@ -87,7 +87,7 @@ fn a_reliable_message_that_never_comes_holds_its_key_for_a_while_only() {
     let max_age = opener.limits().max_age;
     let (retired_at, retirement) = (START * 7, sealer.retire());
     let (used, reliable) = (retirement.used, retirement.reliable);
-    // Nothing has opened yet: the time counts from RETIRE, and only from the first.
+    // No message has opened yet: the time counts from RETIRE, and only from the first one.
     opener.retire(retired_at, b"key", used, reliable).unwrap();
     let last = retired_at + max_age - Duration::from_nanos(1);
     opener.retire(last, b"key", used, reliable).unwrap();

@@ -1,9 +1,8 @@
-//! Random histories of a link against a model simple enough to be seen to be right.
+//! Tests random histories of a link against a model that is simple enough to be checked by reading.
 //!
-//! The model knows nothing of cryptography: it notes for every envelope what it was sealed as, and
-//! for every opener which (key, index) pairs have opened. What the crate does has to be what the
-//! model says, after any interleaving of sealing, loss, duplication, reordering, forgery, RETIRE,
-//! time, restart and change of connection.
+//! The model knows no cryptography. For every envelope it records how it was sealed, and for every opener which (key,
+//! index) pairs have opened. The crate must agree with the model after any interleaving of sealing, loss, duplication,
+//! reordering, forgery, RETIRE, time, restart and change of connection.
 
 mod common;
 
@@ -268,7 +267,7 @@ impl World {
         self.sent.push(Sent { bytes, plaintext, route, key, index, connection });
     }
 
-    /// What the model says about an authentic envelope under the route it was sealed for.
+    /// Returns the model's result for an authentic envelope under the route for which it was sealed.
     fn expected(&self, sent: &Sent) -> Result<(), &'static [RefusalCause]> {
         match self.held.get(&sent.key) {
             None => Err(&[RefusalCause::UnknownKey]),

@@ -1,5 +1,5 @@
-//! What a refusal costs and what it says: the work is counted by an AEAD that keeps a record, in
-//! place of the clock, which proves nothing in a test.
+//! Tests the cost and the text of a refusal. An AEAD that keeps a record counts the work, because the clock proves
+//! nothing in a test.
 //!
 //! The record is the AEAD's view: which operation, and over how many bytes of header and body. It
 //! has to be the same for each cause.
@@ -26,7 +26,7 @@ enum Work {
 }
 
 thread_local! {
-    /// What was done on this thread since [`recorded`] looked last. Each test has its own thread.
+    /// The work on this thread since the last call of [`recorded`]. Each test has its own thread.
     static RECORD: RefCell<Vec<Work>> = const { RefCell::new(Vec::new()) };
 }
 

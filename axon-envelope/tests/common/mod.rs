@@ -1,4 +1,4 @@
-//! What several test files need.
+//! Code that several test files need.
 #![allow(dead_code, reason = "each test file uses its part")]
 
 use std::time::Duration;
