@@ -38,7 +38,7 @@ fn sealed(prefix: [u8; 8], index: u8, plaintext: &[u8]) -> Vec<u8> {
     envelope
 }
 
-/// What parses is spelled out by its fields, byte for byte.
+/// Checks that a header that parses equals the encoding of its fields, byte for byte.
 pub fn header(data: &[u8]) -> bool {
     let Ok((header, length)) = Header::parse(data) else { return false };
     let mut spelled = MAGIC.to_vec();
@@ -53,14 +53,14 @@ pub fn header(data: &[u8]) -> bool {
     true
 }
 
-/// What decodes encodes to the same bytes.
+/// Checks that a header that decodes encodes to the same bytes.
 pub fn inner(data: &[u8]) -> bool {
     let Ok((header, payload)) = inner::Header::decode(data) else { return false };
     assert_eq!([&header.encode()[..], payload].concat(), data);
     true
 }
 
-/// Nothing opens but what the sender seals, byte for byte, and nothing opens twice.
+/// Checks that only bytes that the sender sealed open, and that nothing opens twice.
 pub fn open(data: &[u8]) -> bool {
     let (mut envelope, mut apart) = (data.to_vec(), vec![0; data.len()]);
     let mut opener = opener();

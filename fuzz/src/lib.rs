@@ -1,5 +1,5 @@
-//! What is checked of every parser that reads bytes from outside, apart from the fuzzer that
-//! produces the bytes: so that the seeds can be run through it on any toolchain too.
+//! The checks of every parser that reads bytes from outside. They are separate from the fuzzer that produces the bytes,
+//! so that the seeds can run on any toolchain.
 //!
 //! A check returns whether the parser accepted its input, and panics when a property is violated.
 

@@ -1,5 +1,5 @@
-//! What QUIC hands to TLS: CRYPTO frames of a peer that protects its packets well and says in them
-//! whatever it likes, and datagrams of anybody.
+//! Checks the data that QUIC passes to TLS: CRYPTO frames with any content, of a peer that protects its packets
+//! correctly, and datagrams of any sender.
 
 use std::sync::{Arc, LazyLock, Mutex};
 
@@ -17,7 +17,7 @@ mod meddle;
 #[path = "../../axon-tls/tests/common/pair.rs"]
 mod pair;
 
-/// What an input asks for, after its first byte chose the mode.
+/// The change that an input asks for; its first byte chose the mode.
 #[derive(Clone, Copy, PartialEq)]
 enum Change {
     /// Bytes of the handshake are combined with the data by exclusive or, from a position on.
@@ -33,7 +33,7 @@ enum Change {
 /// `mode || who and how || position (2 bytes) || data`
 struct Input<'a> {
     mode: u8,
-    /// Whose handshake is changed.
+    /// The side whose handshake is changed.
     of: Side,
     change: Change,
     position: usize,

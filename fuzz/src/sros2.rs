@@ -7,8 +7,8 @@ use axon_transport::{graph::EndpointKind, sros2::EnclavePermissions};
 /// The enclave that each seed is about.
 const ENCLAVE: &str = "/arm";
 
-/// A file of permissions. The same input has the same outcome; an error is one line; what is accepted names the
-/// enclave, and judges each kind of endpoint without a panic: what it denies it says with a line of the file, and where
+/// Checks the parser of a permissions file. The same input has the same outcome. An error is one line. An accepted file
+/// names the enclave, and judges each kind of endpoint without a panic. A denial names a line of the file. Where
 /// nothing may be done in a domain, nothing is allowed there.
 pub fn permissions(data: &[u8]) -> bool {
     let Ok(text) = std::str::from_utf8(data) else { return false };
@@ -50,7 +50,7 @@ pub fn permissions(data: &[u8]) -> bool {
     true
 }
 
-/// What `ros2 security` writes, signed and not, and each element that there is.
+/// Returns files that `ros2 security` writes, signed and not, with each existing element.
 pub fn seeds() -> Vec<Vec<u8>> {
     let made = "<dds xmlns:xsi=\"http://www.w3.org/2001/XMLSchema-instance\" \
                 xsi:noNamespaceSchemaLocation=\"http://www.omg.org/spec/DDS-SECURITY/20170901/omg_shared_ca_permissions.xsd\">\n\

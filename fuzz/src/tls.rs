@@ -1,4 +1,4 @@
-//! What the TLS layer reads: hellos, the identity a client offers, and the operator's pins.
+//! Checks the parsers of the TLS layer: hellos, the identity that a client offers, and the operator's pins.
 
 use std::{sync::Arc, time::SystemTime};
 
@@ -9,8 +9,8 @@ use axon_tls::{
 };
 use rustls_axon::{ClientConnection, ServerConnection};
 
-/// What parses, as an identity of either form, is the one spelling of its names; and any two names
-/// that make an identity come back from it.
+/// Checks PSK identities. An identity that parses, of either form, is the one spelling of its names; and any two names
+/// that make an identity are read back from it.
 pub fn psk_identity(data: &[u8]) -> bool {
     let mut accepted = false;
     if let Ok(identity) = PskIdentity::parse(data) {

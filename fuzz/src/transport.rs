@@ -25,7 +25,7 @@ use axon_transport::{
 
 const TERMS: SecurityTerms = SecurityTerms { mode: 0, key_mode: 0, kex: 0, cipher: 0, auth: Some(1) };
 
-/// What decodes encodes to a datagram within bounds that decodes to the same.
+/// Checks that a datagram that decodes encodes to a datagram within bounds that decodes to the same.
 pub fn beacon(data: &[u8]) -> bool {
     let Ok(datagram) = Datagram::decode(data) else { return false };
     assert!(data.len() <= beacon::LONGEST, "a datagram over the bound was read");
@@ -41,7 +41,7 @@ pub fn beacon(data: &[u8]) -> bool {
     true
 }
 
-/// What decodes encodes to a frame that decodes to the same, and compression changes nothing.
+/// Checks that a frame that decodes encodes to a frame that decodes to the same, and that compression changes nothing.
 pub fn link_frame(data: &[u8]) -> bool {
     let decoded = link::LinkMessage::from_frame(data, link::MAX_INFLATED);
     if let Some((&kind, map)) = data.split_first().filter(|(kind, _)| **kind & 0x80 == 0) {
@@ -68,7 +68,7 @@ pub fn link_frame(data: &[u8]) -> bool {
     true
 }
 
-/// What decodes encodes to a packet that decodes to the same.
+/// Checks that a message that decodes encodes to a packet that decodes to the same.
 pub fn session_message(data: &[u8]) -> bool {
     let Ok(message) = session::SessionMessage::decode(data) else { return false };
     match message.encode() {
@@ -83,7 +83,7 @@ pub fn session_message(data: &[u8]) -> bool {
     true
 }
 
-/// What decodes encodes to a packet that decodes to the same.
+/// Checks that a packet that decodes encodes to a packet that decodes to the same.
 pub fn connect_packet(data: &[u8]) -> bool {
     let Some(packet) = reencode_packet(data) else { return false };
     assert_eq!(reencode_packet(&packet), Some(packet));
@@ -96,8 +96,8 @@ fn relay_channels() -> [FlowChannel; 3] {
     [FlowChannel::of(writer), FlowChannel::between(writer, one), FlowChannel::between(writer, other)]
 }
 
-/// Packets of a relayed session, each behind its length: whatever their pieces say, no more is kept
-/// than the session was given credit for, and all of it is given back.
+/// Checks the packets of a relayed session, each behind its length: for any content of the pieces, the session keeps no
+/// more bytes than its credit, and gives back all credit.
 pub fn relay_pieces(data: &[u8]) -> bool {
     const MAX: u64 = 100_000;
     let pool = ArrivalPool::new(MAX);
