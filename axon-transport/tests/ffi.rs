@@ -36,7 +36,7 @@ fn add_files(directory: &Path, extension: &OsStr, files: &mut Vec<PathBuf>) {
     }
 }
 
-/// Whether a program runs; what needs it is skipped where it does not.
+/// Returns whether a program runs. Tests that need a missing program are skipped.
 fn has(program: &str) -> bool {
     let found = Command::new(program).arg("--version").output().is_ok_and(|o| o.status.success());
     if !found {
@@ -56,7 +56,7 @@ fn build(directory: &Path, flags: &[&str]) -> PathBuf {
     program
 }
 
-/// Where the program's sessions are in one process, without a daemon.
+/// Returns the command of a program whose sessions are in one process, without a daemon.
 fn alone(program: impl AsRef<OsStr>) -> Command {
     let mut command = Command::new(program);
     let ours = |name: &str| name.starts_with("AXON_") || name.starts_with("ROS_");
@@ -67,7 +67,7 @@ fn alone(program: impl AsRef<OsStr>) -> Command {
     command
 }
 
-/// As the code says it. `WRITE_HEADER=1` in the environment writes it.
+/// The header equals the one that cbindgen generates from the code. `WRITE_HEADER=1` in the environment writes it.
 #[test]
 fn the_header_is_the_codes() {
     let config = cbindgen::Config::from_file(path("cbindgen.toml")).unwrap();
@@ -110,7 +110,7 @@ fn exported() -> Vec<String> {
     functions().into_iter().map(|(name, _)| name).collect()
 }
 
-/// The same, each with its source.
+/// Returns the same functions, each with its source.
 fn functions() -> Vec<(String, String)> {
     let mut functions = Vec::new();
     for file in files("src/ffi", "rs") {
@@ -124,10 +124,10 @@ fn functions() -> Vec<(String, String)> {
     functions
 }
 
-/// What `guarded` does with a panic, its own tests show.
+/// The tests of `guarded` itself show that it catches panics.
 #[test]
 fn no_function_lets_a_panic_through() {
-    // They only look something up; the first must do so in a signal handler.
+    // These functions only look something up; the first must be able to do so in a signal handler.
     let bare = ["guard_trigger", "policy_name", "abi", "last_error"]
         .map(|name| format!("axon_session_{name}"));
     let open = functions().into_iter().filter(|(_, source)| !source.contains("guarded(||"));
@@ -146,7 +146,7 @@ fn the_test_program_uses_every_function() {
     assert!(exported().len() > 30 && unused.is_empty(), "not used: {unused:?}");
 }
 
-/// What `cargo xtask install-c` fills in and installs.
+/// The file is the one that `cargo xtask install-c` fills in and installs.
 #[test]
 fn the_pkg_config_file_says_how_to_build() {
     if !has("pkg-config") {
@@ -196,7 +196,7 @@ fn a_c_program_uses_every_function_under_valgrind() {
     let directory = tempfile::tempdir().unwrap();
     let program = build(directory.path(), &[]);
     let mut valgrind = alone("valgrind");
-    // It keeps account of the address space, too: what nobody uses of it takes most of the time.
+    // Valgrind tracks the address space, too: unused address space takes most of the time.
     valgrind.envs([("AXON_RING_BUFFER_SIZE_MB", "1"), ("AXON_MAX_MESSAGE_MB", "1")]);
     // A thread that waits for one that does not run gives way to it.
     valgrind.args(["--quiet", "--fair-sched=try", "--error-exitcode=99", "--leak-check=full"]);

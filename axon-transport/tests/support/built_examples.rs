@@ -1,4 +1,4 @@
-//! Has axon-transport's examples built.
+//! Builds axon-transport's examples.
 
 use std::{
     ffi::OsStr,

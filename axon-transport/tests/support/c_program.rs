@@ -10,13 +10,13 @@ use std::{
 
 use built_examples::built_examples;
 
-/// What a static library of Rust needs of the system.
+/// The system libraries that a static library of Rust needs.
 pub(crate) const SYSTEM: &[&str] =
     &["-lgcc_s", "-lutil", "-lrt", "-lpthread", "-lm", "-ldl", "-lc"];
-/// How each of the programs is built.
+/// The compiler flags of each program.
 pub(crate) const WARNINGS: &[&str] = &["-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O1", "-g"];
 
-/// Where something of `axon-transport` is.
+/// Returns the path of a file of `axon-transport`.
 pub(crate) fn path(within: &str) -> PathBuf {
     // The tests of `axon-daemon` use this file, too; its folder is in this one.
     let here = Path::new(env!("CARGO_MANIFEST_DIR"));

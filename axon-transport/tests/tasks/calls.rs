@@ -49,7 +49,7 @@ fn each_of_many_calls_gets_its_own_response() {
                 .map(|number| {
                     let client = client.clone();
                     tokio::spawn(async move {
-                        // Of more than 4 KiB, so that it is taken in place.
+                        // The payload is longer than 4 KiB, so it is taken in place.
                         let payload = number.to_le_bytes().repeat(1000);
                         assert_eq!(client.call(&payload).await.unwrap(), payload);
                     })
