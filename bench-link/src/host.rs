@@ -19,7 +19,7 @@ use tun::Device;
 
 use crate::{Error, Result, part::Part};
 
-/// What a host is asked to start, and where it answers.
+/// A program to start, and the channel for the answer.
 type Order = (Command, mpsc::Sender<io::Result<Child>>);
 
 /// Gives this process the right to make network namespaces, if it does not have it. To be called before
@@ -46,7 +46,7 @@ pub(crate) struct Host {
 }
 
 impl Host {
-    /// A host with this address in 10.77.0.0/24. Programs find it in a directory of its own in `directory`.
+    /// Starts a host with this address in 10.77.0.0/24. Its programs have a directory of their own in `directory`.
     pub(crate) fn start(directory: &Path, number: u8, congestion: &str) -> Result<Self> {
         let (address, peer) = (format!("10.77.0.{number}"), format!("10.77.0.{}", 3 - number));
         let directory = directory.join(format!("host-{number}"));
@@ -85,7 +85,7 @@ impl Host {
         command.env("AXON_RUNTIME_DIR", self.directory.join("run"));
         command.env("AXON_DAEMON_PEERS", &self.peer);
         command.stdin(Stdio::piped()).stdout(Stdio::piped());
-        // Its standard input ends with this process, and it ends with that.
+        // The program's standard input ends with this process, and the program ends with its standard input.
         command.process_group(0);
         let (answer, child) = mpsc::channel();
         self.orders.send((command, answer)).map_err(|_| "the thread of a host has ended")?;
@@ -96,7 +96,7 @@ impl Host {
 fn make_device(address: &str) -> Result<Device> {
     unshare(CloneFlags::CLONE_NEWNET)
         .map_err(|error| format!("a network namespace cannot be made: {error}"))?;
-    // A daemon speaks to its own address, too.
+    // The loopback must be up, because a daemon also sends to its own address.
     let up = Command::new("ip").args(["link", "set", "lo", "up"]).status();
     if !up.is_ok_and(|status| status.success()) {
         return Err("`ip link set lo up` fails: is iproute2 installed?".into());
@@ -137,12 +137,12 @@ impl Running {
         Ok(())
     }
 
-    /// Has it end.
+    /// Makes the program end.
     pub(crate) fn close(&mut self) {
         self.input = None;
     }
 
-    /// Ends it, and returns what it found.
+    /// Ends the program, and returns its result.
     pub(crate) fn end<T: DeserializeOwned>(mut self) -> Result<T> {
         self.input = None;
         let mut text = String::new();

@@ -1,4 +1,4 @@
-//! The programs of a measurement: each publishes or takes what has a number and a time in it.
+//! The programs of a measurement: each publishes or takes messages that contain a number and a time.
 
 use std::{
     io::{self, Write, stdin},
@@ -20,7 +20,7 @@ use crate::{Result, tcp};
 
 /// For daemons that start, find each other over a path that loses packets, and agree on keys.
 const PATIENCE: Duration = Duration::from_secs(60);
-/// How often a subscriber looks whether it is to end.
+/// Time between two checks of a subscriber whether it must end.
 const LOOK: Duration = Duration::from_millis(20);
 /// Bytes of a message's number and time.
 pub(crate) const STAMP: usize = 16;
@@ -30,7 +30,7 @@ pub(crate) const STAMP: usize = 16;
 pub(crate) struct Stream {
     pub(crate) topic: String,
     pub(crate) bytes: usize,
-    /// From message to message. Zero: as fast as possible.
+    /// Time between two messages. Zero: as fast as possible.
     pub(crate) every: Duration,
     pub(crate) is_reliable: bool,
     /// KEEP_LAST's depth. `None`: KEEP_ALL.
@@ -51,21 +51,21 @@ impl Stream {
     }
 }
 
-/// What a program does.
+/// The task of a program.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(crate) enum Part {
     Publish(Stream),
     Subscribe(Stream),
-    /// The same messages over a TCP connection to this address.
+    /// Sends the same messages over a TCP connection to this address.
     Send(Stream, String),
     Receive(String),
 }
 
-/// What a publisher did.
+/// The result of a publisher.
 #[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
 pub(crate) struct Sent {
     pub(crate) messages: u64,
-    /// Those of them that the publisher was refused, since its history was full.
+    /// Number of these messages that were refused, since the publisher's history was full.
     pub(crate) refused: u64,
 }
 
@@ -77,16 +77,16 @@ pub(crate) struct Arrival {
     pub(crate) arrived: u64,
 }
 
-/// What a subscriber took.
+/// The result of a subscriber.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub(crate) struct Taken {
     pub(crate) arrivals: Vec<Arrival>,
-    /// What the subscription counts as lost.
+    /// Number of messages that the subscription counts as lost.
     pub(crate) lost: u64,
 }
 
 impl Part {
-    /// Is this program, until its standard input ends. What it found is the last line of its output.
+    /// Runs this program until its standard input ends. The last line of its output is its result.
     pub(crate) fn run(&self) -> Result<()> {
         let orders = lines();
         match self {
@@ -98,14 +98,14 @@ impl Part {
     }
 }
 
-/// Says that it is ready for its orders.
+/// Prints a value as a line, such as the report that the program is ready for its orders.
 pub(crate) fn say<T: Serialize>(value: &T) -> Result<()> {
     let mut out = io::stdout().lock();
     writeln!(out, "{}", serde_json::to_string(value)?)?;
     Ok(out.flush()?)
 }
 
-/// The lines of standard input. It disconnects where that ends.
+/// Returns the lines of standard input. The receiver is disconnected when the input ends.
 fn lines() -> Receiver<()> {
     let (sender, receiver) = channel();
     thread::spawn(move || {
@@ -118,7 +118,7 @@ fn lines() -> Receiver<()> {
     receiver
 }
 
-/// Nanoseconds of the clock that all programs share.
+/// Returns the time of the clock that all programs share, in nanoseconds.
 pub(crate) fn now_ns() -> u64 {
     let now = clock_gettime(ClockId::Monotonic);
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
@@ -130,7 +130,7 @@ pub(crate) fn stamp(bytes: &mut [u8], number: u64) {
     bytes[8..STAMP].copy_from_slice(&now_ns().to_le_bytes());
 }
 
-/// The message that these bytes are of, which arrives now.
+/// Returns the arrival of the message in these bytes, at the current time.
 pub(crate) fn arrival(bytes: &[u8]) -> Result<Arrival> {
     let word = |at: usize| bytes.get(at..at + 8).and_then(|word| word.try_into().ok());
     let number = word(0).map(u64::from_le_bytes).ok_or("a message without a number")?;
@@ -163,7 +163,7 @@ fn session() -> Result<Session> {
     Ok(Session::open(&Config::from_env()?, options)?)
 }
 
-/// Bytes that no compressor makes shorter: what crosses is what is published.
+/// Returns bytes that no compressor makes shorter, so that the link carries as many bytes as are published.
 fn incompressible(length: usize) -> Vec<u8> {
     let mut bytes = vec![0; length];
     StdRng::seed_from_u64(0).fill_bytes(&mut bytes);
@@ -191,7 +191,7 @@ fn publish(stream: &Stream, orders: &Receiver<()>) -> Result<()> {
         Ok(())
     })?;
     say(&sent)?;
-    // What waits goes on until the one that measures ends this process.
+    // The waiting messages are still sent until the measuring process ends this one.
     thread::sleep(PATIENCE);
     Ok(())
 }

@@ -9,7 +9,7 @@ use rand::{RngExt, rngs::StdRng};
 pub(crate) struct Loss {
     /// The share of packets that is lost.
     pub(crate) share: f64,
-    /// How many packets in a row are lost, on average. 1: each by itself.
+    /// Mean length of a burst of lost packets. 1: packets are lost independently.
     pub(crate) burst: f64,
 }
 
@@ -17,21 +17,21 @@ impl Loss {
     pub(crate) const NONE: Self = Self { share: 0.0, burst: 1.0 };
 }
 
-/// What a path does to packets.
+/// The effects of a path on packets.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Settings {
     /// Bits a second.
     pub(crate) rate: f64,
     /// Bytes that may wait for their turn.
     pub(crate) queue: usize,
-    /// From the end of a packet here to its arrival.
+    /// Time from the end of a packet on this side to its arrival.
     pub(crate) delay: Duration,
     pub(crate) loss: Loss,
-    /// Nothing gets through.
+    /// Whether no packet gets through.
     pub(crate) is_cut: bool,
 }
 
-/// What became of the packets.
+/// Counters of packets, by their fate.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Counters {
     pub(crate) packets: u64,
@@ -40,7 +40,7 @@ pub(crate) struct Counters {
 }
 
 impl Counters {
-    /// What came since `before`.
+    /// Returns the differences to the counters `before`.
     pub(crate) fn since(&self, before: &Self) -> Self {
         Self {
             packets: self.packets - before.packets,
@@ -49,7 +49,7 @@ impl Counters {
         }
     }
 
-    /// Those that the path took and lost, in percent.
+    /// Returns the lost packets as a percentage of those that the path took.
     pub(crate) fn lost_percent(&self) -> f64 {
         100.0 * self.lost as f64 / (self.packets - self.overflowed).max(1) as f64
     }
@@ -71,7 +71,7 @@ impl Path {
         Self { settings, counters: Counters::default(), free_at: now, is_bad: false, random }
     }
 
-    /// When a packet of this many bytes, which comes now, is at the other end; `None` if it never is.
+    /// Returns when a packet of this many bytes, which comes now, reaches the other end; `None` if it is lost.
     pub(crate) fn handle_packet(&mut self, now: Instant, bytes: usize) -> Option<Instant> {
         self.counters.packets += 1;
         if self.settings.is_cut {
@@ -92,7 +92,7 @@ impl Path {
         Some(self.free_at + self.settings.delay)
     }
 
-    /// Gilbert's model: between bursts nothing is lost, within one everything.
+    /// Returns whether a packet is lost, by Gilbert's model: none between bursts, every one within a burst.
     fn is_lost(&mut self) -> bool {
         let Loss { share, burst } = self.settings.loss;
         if burst <= 1.0 {

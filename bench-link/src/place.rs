@@ -1,4 +1,4 @@
-//! Where a measurement takes place: two hosts and the path between them.
+//! The place of a measurement: two hosts and the path between them.
 
 use std::{sync::Arc, thread, time::Duration};
 
@@ -12,12 +12,12 @@ use crate::{
     relay::Relay,
 };
 
-/// Where TCP's receiver listens.
+/// The port on which TCP's receiver listens.
 const PORT: u16 = 7400;
-/// How long what was sent may still be under way.
+/// Maximum time for which sent messages may still be in flight.
 const SETTLE: Duration = Duration::from_millis(1_500);
 
-/// What carries the messages.
+/// The transport of the messages.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Carrier {
     Axon,
@@ -35,7 +35,7 @@ impl Carrier {
     }
 }
 
-/// What became of a stream.
+/// The results of a stream.
 #[derive(Clone, Debug)]
 pub(crate) struct Outcome {
     pub(crate) sent: Sent,
@@ -46,7 +46,7 @@ pub(crate) struct Outcome {
 pub(crate) struct Place {
     hosts: [Host; 2],
     pub(crate) relay: Relay,
-    /// Where the hosts keep their files, such as the logs of their daemons.
+    /// The directory for the hosts' files, such as the logs of their daemons.
     _directory: TempDir,
 }
 
@@ -85,7 +85,7 @@ impl Place {
         Ok(Streams(running))
     }
 
-    /// What became of streams that flow for this long.
+    /// Runs streams for `time`, and returns their results.
     pub(crate) fn measure(
         &self,
         carrier: Carrier,

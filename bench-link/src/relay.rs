@@ -49,7 +49,7 @@ impl Relay {
         }
     }
 
-    /// What became of the packets from the first host to the second so far.
+    /// Returns the counters of the packets from the first host to the second so far.
     pub(crate) fn counters(&self) -> Counters {
         self.directions[0].lock().unwrap_or_else(PoisonError::into_inner).counters
     }

@@ -1,4 +1,4 @@
-//! The same messages over TCP: what a program without a middleware would do.
+//! Sends the same messages over TCP, as a program without a middleware would.
 
 use std::{
     collections::VecDeque,
@@ -19,12 +19,12 @@ use crate::{
     part::{STAMP, Sent, Stream, Taken, arrival, paced, say, stamp},
 };
 
-/// What the kernel may hold that it has not sent yet, so that a newer message can replace an older one.
+/// Maximum number of unsent bytes in the kernel, so that a newer message can replace an older one.
 const UNSENT: u32 = 16 << 10;
-/// How often a connection is tried, and for how long. TCP waits longer each time for an answer.
+/// Number of attempts to connect, and the timeout of each. TCP waits longer each time for an answer.
 const ATTEMPTS: u32 = 8;
 const ATTEMPT: Duration = Duration::from_secs(4);
-/// How often a receiver looks whether it is to end.
+/// Time between two checks of a receiver whether it must end.
 const LOOK: Duration = Duration::from_millis(20);
 /// Messages that a stream without a depth holds.
 const MOST_WAITING: usize = 1_000;
@@ -36,14 +36,14 @@ struct Waiting {
     changed: Condvar,
 }
 
-/// The congestion controller that the kernel takes for a connection.
+/// Returns the congestion controller that the kernel takes for a connection.
 pub(crate) fn congestion() -> Result<String> {
     let socket = Socket::new(Domain::IPV4, Type::STREAM, None)?;
     let name = socket.tcp_congestion()?;
     Ok(String::from_utf8_lossy(&name).trim_end_matches('\0').to_owned())
 }
 
-/// A connection; `None` where the path loses too much for one.
+/// Connects. Returns `None` if the path loses too much for a connection.
 fn connect(address: &str) -> Result<Option<TcpStream>> {
     let address = address.parse()?;
     for _ in 0..ATTEMPTS {
@@ -93,7 +93,7 @@ pub(crate) fn send(stream: &Stream, address: &str, orders: &Receiver<()>) -> Res
     say(&sent)?;
     waiting.messages.lock().unwrap_or_else(PoisonError::into_inner).1 = true;
     waiting.changed.notify_all();
-    // What waits goes on until the one that measures ends this process.
+    // The waiting messages are still sent until the measuring process ends this one.
     let _ = writer.join();
     Ok(())
 }

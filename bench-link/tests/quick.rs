@@ -8,14 +8,14 @@ use std::{fs, process::Command};
 use excerpt::excerpt;
 use serde_json::Value;
 
-/// What the program says where it may not make hosts.
+/// The errors of the program if it may not create hosts.
 const NOT_HERE: [&str; 3] = [
     "a network namespace cannot be made",
     "the device of a host cannot be made",
     "is iproute2 installed",
 ];
 
-/// The figures, or `None` where this machine cannot have them.
+/// Returns the figures, or `None` if this machine cannot measure them.
 fn figures(arguments: &[&str]) -> Option<Value> {
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("figures.json");
@@ -44,9 +44,9 @@ fn reliable_samples_arrive_over_a_lossy_path() {
         let arrived = row["arrived_percent"].as_f64().unwrap();
         match row["message"].as_str().unwrap() {
             "1 KB, RELIABLE" if row["carrier"] == "AXON" => assert_eq!(arrived, 100.0, "{row}"),
-            // TCP promises nothing over such a path.
+            // TCP guarantees nothing over this path.
             _ if row["carrier"] == "TCP" => {}
-            // Of lone packets a fifth is lost.
+            // The path loses a fifth of lone packets.
             "1 KB, BEST_EFFORT" => assert!(arrived > 50.0, "{row}"),
             _ => assert!(arrived > 0.0, "{row}"),
         }

@@ -12,7 +12,7 @@ use crate::{
     table::Table,
 };
 
-/// A camera of 25 MB/s and a command at 100 Hz.
+/// Measures a camera of 25 MB/s beside a command at 100 Hz.
 pub(crate) fn camera(options: &Options) -> Result<Value> {
     println!(
         "\nA command of 100 B at 100 Hz, RELIABLE, beside a camera of 25 MB/s, RELIABLE, depth 1.\n"

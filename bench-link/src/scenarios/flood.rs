@@ -1,4 +1,4 @@
-//! How much of the path's rate a stream gets.
+//! Measures which share of the path's rate a stream gets.
 
 use std::time::Duration;
 
@@ -15,7 +15,8 @@ use crate::{
 
 const BYTES: usize = 16 << 10;
 
-/// A KEEP_ALL stream as fast as it goes: over the path at each loss, and with a round trip of 100 ms and 1 % loss.
+/// Measures a KEEP_ALL stream without a rate limit: over the path at each loss, and with a round trip of 100 ms and 1 %
+/// loss.
 pub(crate) fn flood(options: &Options) -> Result<Value> {
     println!(
         "\nA KEEP_ALL stream of 16 KiB samples as fast as the path takes it, share of the path's rate.\n"

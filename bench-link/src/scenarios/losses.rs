@@ -1,4 +1,4 @@
-//! What arrives in time at which loss.
+//! Measures which messages arrive in time at each loss.
 
 use std::time::Duration;
 
@@ -49,7 +49,7 @@ const ROWS: [Row; 4] = [
     },
 ];
 
-/// Messages at 30 Hz, one size after the other, at each loss, both ways.
+/// Measures messages at 30 Hz, one size after the other, at each loss, both ways.
 pub(crate) fn losses(options: &Options) -> Result<Value> {
     println!("\nMessages at {HZ} Hz, each size alone, share of those published that arrives.\n");
     let header = [

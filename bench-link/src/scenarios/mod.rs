@@ -1,4 +1,4 @@
-//! What is measured. Each scenario prints its figures and returns them as JSON.
+//! The scenarios of the measurement. Each prints its figures and returns them as JSON.
 
 mod camera;
 mod cut;
@@ -16,12 +16,12 @@ pub(crate) use slow::slow;
 
 use crate::{path::Settings, place::Outcome};
 
-/// What all scenarios are told.
+/// The options of all scenarios.
 #[derive(Clone, Debug)]
 pub(crate) struct Options {
     /// The path, without losses.
     pub(crate) path: Settings,
-    /// How long each stream flows.
+    /// The duration of each stream.
     pub(crate) time: Duration,
     /// The losses that are tried.
     pub(crate) losses: Vec<f64>,
@@ -43,20 +43,20 @@ impl Outcome {
         ages
     }
 
-    /// The share of the messages that arrived within this time, in percent.
+    /// Returns the share of the messages that arrived within this time, in percent.
     fn within(&self, time: Duration) -> f64 {
         let most = time.as_nanos() as u64;
         let count = self.ages().iter().filter(|age| **age <= most).count();
         100.0 * count as f64 / self.sent.messages.max(1) as f64
     }
 
-    /// The share that arrived at all, in percent.
+    /// Returns the share that arrived at all, in percent.
     fn arrived(&self) -> f64 {
         self.within(Duration::MAX)
     }
 }
 
-/// The age below which so many percent are, in milliseconds.
+/// Returns the age that `percent` percent of the messages do not exceed, in milliseconds.
 fn quantile(ages: &[u64], percent: usize) -> Option<f64> {
     let at = (ages.len().checked_sub(1)? * percent) / 100;
     Some(ages[at] as f64 / MS as f64)

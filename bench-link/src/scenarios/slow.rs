@@ -14,10 +14,10 @@ use crate::{
 
 /// Bits a second.
 const SLOW: f64 = 2e6;
-/// From a change of the rate until ages count.
+/// Time from a change of the rate until ages count.
 const AFTER: u64 = 2_000 * MS;
 
-/// From the path's rate to 2 Mbit/s and back, under messages of 64 KB at 30 Hz with a depth of 1.
+/// Measures messages of 64 KB at 30 Hz with a depth of 1, while the path's rate falls to 2 Mbit/s and comes back.
 pub(crate) fn slow(options: &Options) -> Result<Value> {
     println!(
         "\n64 KB at 30 Hz, RELIABLE, depth 1; the rate falls to 2 Mbit/s and comes back. Ages from 2 s after.\n"
