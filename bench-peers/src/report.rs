@@ -52,7 +52,7 @@ enum Cell {
     Rate,
 }
 
-/// p50, p99 and processor time of each medium, or messages and bytes a second; then the ratios.
+/// Returns a table: p50, p99 and processor time of each medium, or messages and bytes a second; then the ratios.
 fn table<'a>(rows: impl Iterator<Item = &'a Compared>, cell: Cell) -> String {
     let headers: &[&'static str] = match cell {
         Cell::Time => &[
