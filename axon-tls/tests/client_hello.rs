@@ -60,7 +60,7 @@ fn hybrid_mode() {
     }
 }
 
-/// The ClientHello over TCP and the one over QUIC.
+/// Returns the ClientHello over TCP and the one over QUIC.
 fn qkd_hellos(cipher: Cipher, kex: PskKex) -> [ClientHello; 2] {
     let tcp = qkd::client_config(psk(1, cipher), kex, ALPN).unwrap();
     let conn = rustls_axon::ClientConnection::new(Arc::new(tcp), "axon".try_into().unwrap());
@@ -72,7 +72,7 @@ fn qkd_hellos(cipher: Cipher, kex: PskKex) -> [ClientHello; 2] {
     [ClientHello::parse(in_record(&record)), quic]
 }
 
-/// The ClientHello over QUIC. The server is there for its address alone.
+/// Returns the ClientHello over QUIC. The server only provides an address.
 fn over_quic(config: quinn::ClientConfig) -> ClientHello {
     let cipher = Cipher::default();
     let server = qkd_server(OneKey::none(), cipher, PskKex::default(), ALPN).unwrap();

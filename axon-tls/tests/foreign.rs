@@ -22,7 +22,7 @@ use rustls_axon::external_psk::{
 use rustls_axon::{HandshakeKind, ServerConfig, ServerConnection};
 use zeroize::Zeroizing;
 
-/// Every cipher and mode that `program` can do.
+/// Runs the test for every cipher and mode that `program` supports.
 fn with_openssl(test: impl Fn(&str, Cipher, PskKex)) {
     for (program, has_group) in openssls() {
         for cipher in Cipher::ALL {
@@ -148,7 +148,7 @@ fn gnutls_both_ways_and_its_classical_groups_refused() {
     }
 }
 
-/// A server of rustls-axon whose only group is one that no client sends a share of at first.
+/// Creates a server of rustls-axon whose only group is one of which no client sends a share at first.
 fn retrying_server() -> ServerConnection {
     let cipher = Cipher::ChaCha20Poly1305;
     let (identity, secret) = vector(cipher);

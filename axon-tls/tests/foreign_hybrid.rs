@@ -33,7 +33,7 @@ fn run(program: &str, args: &[&str]) -> Vec<u8> {
 }
 
 impl Theirs {
-    /// Signed by itself, or by `issuer`.
+    /// Creates a certificate that is signed by itself, or by `issuer`.
     fn new(program: &str, algorithm: &str, issuer: Option<&Self>) -> Self {
         let (key, certificate) = (file("theirs.key", ""), file("theirs.crt", ""));
         run(program, &["genpkey", "-algorithm", algorithm, "-out", &key]);
@@ -73,7 +73,7 @@ fn suite(cipher: Cipher) -> &'static str {
 
 const RAW_KEYS: [&str; 2] = ["-enable_server_rpk", "-enable_client_rpk"];
 
-/// `s_server` or `s_client`, with its key, for the hybrid group alone.
+/// Starts `s_server` or `s_client`, with its key, only for the hybrid group.
 fn start(program: &str, command: &[&str], theirs: &Theirs, cipher: Cipher, more: &[&str]) -> Peer {
     let mut args = command.to_vec();
     args.extend(["-tls1_3", "-groups", "X25519MLKEM768", "-ciphersuites", suite(cipher)]);
@@ -112,7 +112,7 @@ fn dialled(
     Ok(negotiated.peer.unwrap())
 }
 
-/// The outcome of their client with our server.
+/// Returns the outcome of their client with our server.
 fn accepted(
     program: &str,
     auth: &Auth,

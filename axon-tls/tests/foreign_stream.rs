@@ -39,7 +39,7 @@ async fn connected(program: &str, cipher: Cipher) -> (TlsStream<TcpStream>, Peer
     (connector.connect(name, TcpStream::from_std(socket).unwrap()).await.unwrap(), peer)
 }
 
-/// A line each way; then the peer's process is killed, or this end says that it is done.
+/// Exchanges a line each way. Then the test kills the peer's process, or this end closes.
 async fn talk(mut stream: TlsStream<TcpStream>, mut peer: Peer, cipher: Cipher, kill: bool) {
     is_on(stream.negotiated(), cipher, PskKex::PskKe);
     stream.write_all(b"from axon\n").await.unwrap();

@@ -81,7 +81,7 @@ impl Ca {
     }
 }
 
-/// A handshake in memory, to its end or the first error of either side.
+/// Runs a handshake in memory, to its end or the first error of either side.
 fn handshake(client: &Auth, server: &Auth) -> Result<(), rustls::Error> {
     let config = hybrid::client_config(client, Cipher::default(), b"").unwrap();
     let name = "whatever.example".try_into().unwrap();

@@ -94,7 +94,7 @@ fn accepts(mut us: Connection, mut peer: Connection) -> bool {
     !us.is_handshaking() && hybrid::negotiated(&us).is_some()
 }
 
-/// Cut at each byte, with one bit of each byte flipped, with something behind.
+/// Returns mutations: cut at each byte, with one bit of each byte flipped, and with bytes appended.
 fn mutations(whole: &[u8]) -> Vec<Vec<u8>> {
     let cut = (0..whole.len()).map(|end| whole[..end].to_vec());
     let flipped = (0..whole.len()).map(|at| {

@@ -142,7 +142,8 @@ impl PskResolver for EveryHash {
     }
 }
 
-/// A stranger that offers a QKD key under each hash, or keys that the server does not know.
+/// Returns the configuration of a stranger that offers a QKD key under each hash, or keys that the server does not
+/// know.
 fn offering(offers: &[(&str, [u8; 32], HashAlgorithm)]) -> ClientConfig {
     let import = |(key_id, key, hash): &(&str, [u8; 32], HashAlgorithm)| {
         let context = b"\x00\x05robot\x00\x04base";

@@ -27,8 +27,8 @@ fn table<const N: usize>(keys: [Arc<Psk>; N]) -> Arc<PskTable> {
     Arc::new(PskTable::new(keys).unwrap())
 }
 
-/// The identity that a connection between a client with `keys` and a server with `known` runs on, or the
-/// alert that ended it.
+/// Connects a client with `keys` and a server with `known`. Returns the identity of the connection, or the alert that
+/// ended it.
 async fn agreed(keys: Vec<Arc<Psk>>, known: Arc<PskTable>, kex: PskKex) -> Result<Vec<u8>, u8> {
     let cipher = keys[0].cipher();
     let client = psk_client(keys, kex, ALPN).unwrap();

@@ -140,7 +140,7 @@ async fn modes_do_not_mix() {
     }
 }
 
-/// A client on quinn's own TLS that has classical groups alone.
+/// Returns a client on quinn's own TLS with classical groups only.
 fn classical_client(groups: Vec<&'static dyn SupportedKxGroup>) -> quinn::ClientConfig {
     let provider = CryptoProvider { kx_groups: groups, ..default_provider() };
     let mut tls = rustls::ClientConfig::builder_with_provider(Arc::new(provider))

@@ -21,7 +21,7 @@ use rustls_axon::quic::{ClientConnection, Version};
 
 const NO_APPLICATION_PROTOCOL: u8 = 120;
 
-/// Client and server in every mode with every cipher.
+/// Returns client and server in every mode with every cipher.
 fn modes() -> Vec<(ClientConfig, ServerConfig, KeyExchange)> {
     let auth = Auth::None(SigningKey::generate().unwrap());
     let mut modes = Vec::new();
@@ -51,7 +51,7 @@ impl Meddler for Counting {
     }
 }
 
-/// Something in each direction, over new streams.
+/// Exchanges data in each direction, over new streams.
 fn exchange(pair: &mut Pair) {
     let say = |end: &mut End| {
         let stream = end.conn().streams().open(Dir::Uni).unwrap();

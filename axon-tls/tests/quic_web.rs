@@ -48,7 +48,7 @@ fn server_tls(ca: &Authority, provider: CryptoProvider) -> ServerConfig {
     tls
 }
 
-/// quinn's own TLS on our provider.
+/// Returns a client with quinn's own TLS on our provider.
 fn stock_client(ca: &Authority) -> quinn::ClientConfig {
     let tls = Arc::new(client_tls(ca, hybrid::provider()));
     let crypto = QuicClientConfig::with_initial(tls, hybrid::quic_initial_suite()).unwrap();

@@ -155,7 +155,7 @@ fn handshake(client: &mut ClientConnection, server: &mut ServerConnection) -> Ou
     outcome
 }
 
-/// A key of an algorithm that we make ourselves, for us and for a stranger.
+/// Creates a key of an algorithm that we generate ourselves, for us and for a stranger.
 fn ours(algorithm: KeyAlgorithm) -> (SigningKey, Key) {
     let pem = SigningKey::generate_pem_with(algorithm).unwrap();
     let der = rustls::pki_types::pem::PemObject::from_pem_slice(pem.as_bytes()).unwrap();

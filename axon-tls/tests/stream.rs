@@ -43,7 +43,7 @@ async fn dial<IO: AsyncRead + AsyncWrite + Unpin>(io: IO) -> std::io::Result<Tls
     connector().connect("server".try_into().unwrap(), io).await
 }
 
-/// Both ends of a connection over `near` and `far`.
+/// Returns both ends of a connection over `near` and `far`.
 async fn connected<N, F>(near: N, far: F) -> (TlsStream<N>, TlsStream<F>)
 where
     N: AsyncRead + AsyncWrite + Unpin,
@@ -280,7 +280,7 @@ async fn acceptor_refuses_a_plaintext_request() {
     assert_eq!(err.kind(), ErrorKind::InvalidData);
 }
 
-/// Both ends of a handshake that fails.
+/// Returns the errors of both ends of a handshake that fails.
 async fn refused(
     client: Arc<ClientConfig>,
     server: Arc<ServerConfig>,

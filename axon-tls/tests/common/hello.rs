@@ -28,7 +28,7 @@ const CLIENT_SHARE_LEN: usize = 1_216;
 /// 1,088 bytes of ML-KEM-768 and 32 of X25519.
 const SERVER_SHARE_LEN: usize = 1_120;
 
-/// The one message in a record.
+/// Returns the one message in a record.
 pub(crate) fn in_record(record: &[u8]) -> &[u8] {
     let mut record = Reader(record);
     assert_eq!(record.take(1), [22], "a handshake record");

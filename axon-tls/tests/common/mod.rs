@@ -22,7 +22,7 @@ pub(crate) const CLIENT_SAE: &str = "sae-client";
 pub(crate) const SERVER_SAE: &str = "sae-server";
 pub(crate) const KEY_ID: &str = "bc490419-7d60-487f-adc1-4ddcc177c139";
 
-/// The key of both ends, or another one, as each end derives it.
+/// Returns the key of both ends, or another one, as each end derives it.
 pub(crate) fn psk(key: u8, cipher: Cipher) -> Arc<Psk> {
     Arc::new(derive_psk(&[key; 32], KEY_ID, CLIENT_SAE, SERVER_SAE, cipher).unwrap())
 }
@@ -63,7 +63,7 @@ pub(crate) struct Outcome {
 }
 
 impl Outcome {
-    /// The alert that both ends saw. Fails if one of them completed the handshake.
+    /// Returns the alert that both ends saw. Fails if one of them completed the handshake.
     #[track_caller]
     pub(crate) fn alert(&self) -> u8 {
         let client = self.client.as_ref().expect_err("the client must not complete");

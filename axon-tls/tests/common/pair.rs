@@ -40,7 +40,7 @@ pub(crate) struct Pair {
 }
 
 impl Pair {
-    /// Two endpoints, of which none has a connection yet.
+    /// Creates two endpoints without a connection.
     pub(crate) fn new(server: ServerConfig) -> Self {
         let end = |port, server| End {
             // probes for a larger MTU would add to what a handshake sends
@@ -108,7 +108,7 @@ impl Pair {
 }
 
 impl End {
-    /// The connection, of which there has to be one.
+    /// Returns the connection, which must exist.
     pub(crate) fn conn(&mut self) -> &mut Connection {
         &mut self.conn.as_mut().expect("there is a connection").1
     }

@@ -21,7 +21,7 @@ impl Authority {
         Self { pem, issuer: rcgen::Issuer::new(params, key) }
     }
 
-    /// A certificate for `san` with its key.
+    /// Issues a certificate for `san` with its key.
     pub(crate) fn certify(&self, serial: u64, san: &str) -> (rcgen::Certificate, rcgen::KeyPair) {
         let key = rcgen::KeyPair::generate().unwrap();
         let mut params = rcgen::CertificateParams::new([san.to_owned()]).unwrap();
@@ -29,7 +29,7 @@ impl Authority {
         (params.signed_by(&key, &self.issuer).unwrap(), key)
     }
 
-    /// An end that trusts `roots` and shows a certificate of this authority.
+    /// Creates an end that trusts `roots` and shows a certificate of this authority.
     pub(crate) fn member(&self, serial: u64, san: &str, roots: &Self, crl: Option<&str>) -> Auth {
         let (certificate, key) = self.certify(serial, san);
         let material =

@@ -29,7 +29,7 @@ fn protocols(alpn: &[u8]) -> Vec<Vec<u8>> {
     if alpn.is_empty() { vec![] } else { vec![alpn.to_vec()] }
 }
 
-/// A client with a certificate of `ca`. With `early_data` it sends some wherever a ticket allows it.
+/// Creates a client with a certificate of `ca`. With `early_data` it sends some wherever a ticket allows it.
 pub(crate) fn client(ca: &Authority, alpn: &[u8], early_data: bool) -> quinn::ClientConfig {
     let (chain, key) = shown(ca);
     let mut tls = ClientConfig::builder_with_provider(Arc::new(hybrid::provider()))
@@ -45,7 +45,7 @@ pub(crate) fn client(ca: &Authority, alpn: &[u8], early_data: bool) -> quinn::Cl
     quinn::ClientConfig::new(Arc::new(crypto))
 }
 
-/// A server with a certificate of `ca`. With `early_data` its tickets allow it.
+/// Creates a server with a certificate of `ca`. With `early_data` its tickets allow it.
 pub(crate) fn server(ca: &Authority, alpn: &[u8], early_data: bool) -> quinn::ServerConfig {
     let (chain, key) = shown(ca);
     let provider = Arc::new(hybrid::provider());

@@ -51,7 +51,7 @@ pub(crate) struct Packet<'a> {
     bytes: &'a [u8],
 }
 
-/// The packets of a datagram (RFC 9000 section 12.2).
+/// Returns the packets of a datagram (RFC 9000 section 12.2).
 pub(crate) fn packets(mut datagram: &[u8]) -> Vec<Packet<'_>> {
     let mut packets = Vec::new();
     while let Some(first) = datagram.first() {
@@ -121,7 +121,7 @@ impl InitialKeys {
         }
     }
 
-    /// The frames in an Initial packet.
+    /// Returns the frames in an Initial packet.
     pub(crate) fn open(&self, packet: &Packet<'_>) -> Vec<u8> {
         let (pn_offset, mut bytes) = (packet.pn_offset, packet.bytes.to_vec());
         let hp = HeaderProtectionKey::new(&AES_128, &self.hp).unwrap();
@@ -141,7 +141,7 @@ impl InitialKeys {
     }
 }
 
-/// HKDF-Expand-Label of RFC 8446 section 7.1, with an empty context.
+/// Computes HKDF-Expand-Label of RFC 8446 section 7.1, with an empty context.
 fn expand_label(secret: &Prk, label: &[u8], len: usize) -> Vec<u8> {
     struct Len(usize);
     impl KeyType for Len {

@@ -72,7 +72,7 @@ impl Drop for Peer {
     }
 }
 
-/// A free port that no other test of this process gets, outside the range the system hands out.
+/// Returns a free port that no other test of this process gets, outside the range that the system assigns.
 pub(crate) fn port() -> u16 {
     static NEXT: AtomicU16 = AtomicU16::new(0);
     loop {
@@ -178,7 +178,7 @@ fn version_of(program: &str, ask: &str) -> Option<String> {
     String::from_utf8_lossy(&output.stdout).lines().next().map(str::to_owned)
 }
 
-/// The `openssl` of the system, and the one of `TEST_OPENSSL`, which have X25519MLKEM768 or not.
+/// Returns the `openssl` of the system, and the one of `TEST_OPENSSL`, each with whether it has X25519MLKEM768.
 pub(crate) fn openssls() -> Vec<(String, bool)> {
     let mut found = Vec::new();
     for program in ["openssl".to_owned()].into_iter().chain(std::env::var("TEST_OPENSSL").ok()) {

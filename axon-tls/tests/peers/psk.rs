@@ -10,14 +10,14 @@ use super::{LABEL, Peer, file};
 
 const KEY_ID: &str = "bc490419-7d60-487f-adc1-4ddcc177c139";
 
-/// The PSK that follows from the key of the vectors with another first byte, 0 being the right one.
+/// Returns the PSK that follows from the key of the vectors with another first byte; 0 is the right one.
 pub(crate) fn psk(cipher: Cipher, first_byte: u8) -> Arc<Psk> {
     let mut key: [u8; 32] = std::array::from_fn(|at| at as u8);
     key[0] = first_byte;
     Arc::new(derive_psk(&key, KEY_ID, "sae-client", "sae-server", cipher).unwrap())
 }
 
-/// Identity and key as the independent script derived them, in hexadecimal.
+/// Returns identity and key as the independent script derived them, in hexadecimal.
 pub(crate) fn vector(cipher: Cipher) -> (String, String) {
     let hash = if cipher == Cipher::Aes256Gcm { "SHA384" } else { "SHA256" };
     let vectors: Vec<serde_json::Value> =
