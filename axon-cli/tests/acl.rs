@@ -24,7 +24,7 @@ fn written(dir: &Path, name: &str, rules: &str) -> String {
     path.to_str().expect("UTF-8").to_owned()
 }
 
-/// The blocks of a language in the page.
+/// Returns the blocks of a language in the page.
 fn blocks<'a>(page: &'a str, language: &str) -> Vec<&'a str> {
     let begin = format!("```{language}\n");
     page.split(&begin).skip(1).filter_map(|rest| rest.split("```").next()).collect()
@@ -152,7 +152,7 @@ fn check_takes_the_rules_that_the_settings_name_and_rules_beside_other_settings(
     assert!(text(&output.stderr).contains("unknown key \"quic_cypher\""));
 }
 
-/// The file as AXON_CONFIG names it, and as an argument.
+/// Tests the file as AXON_CONFIG names it, and as an argument.
 fn rules_among_settings(dir: &tempfile::TempDir, name: &str, rules: &str) {
     let file = written(dir.path(), name, rules);
     let run_dir = dir.path().join("run");

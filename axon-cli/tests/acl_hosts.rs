@@ -36,7 +36,7 @@ impl Ruled {
         command.env("AXON_ACCESS_FILE", &self.rules).output().expect("runs")
     }
 
-    /// Standard output and standard error of `axon acl check` about the only peer.
+    /// Returns standard output and standard error of `axon acl check` about the only peer.
     fn check(&self, what: &str, name: &str) -> (String, String) {
         let status = self.host.status().expect("a status");
         let peer = status["links"][0]["party"].as_str().expect("a party").to_owned();

@@ -24,7 +24,7 @@ fn written(dir: &Path, name: &str, bytes: impl AsRef<[u8]>) -> String {
     path.to_str().expect("UTF-8").to_owned()
 }
 
-/// The first block of a language behind a heading of the page.
+/// Returns the first block of a language behind a heading of the page.
 fn block(language: &str) -> &'static str {
     let section = PAGE.split("## From SROS2's permissions").nth(1).expect("the section");
     let rest = section.split(&format!("```{language}\n")).nth(1).expect("a block");

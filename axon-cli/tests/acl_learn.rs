@@ -70,7 +70,7 @@ impl Hosts {
         Self { robot, base, rules, dir, daemons }
     }
 
-    /// `axon acl learn` on the robot, once it watches.
+    /// Starts `axon acl learn` on the robot, and waits until it watches.
     fn learn(&self, arguments: &[&str]) -> (Running, BufReader<ChildStderr>) {
         let arguments = [&["acl", "learn"], arguments].concat();
         let mut learn = Running::start(self.robot.axon(&arguments));

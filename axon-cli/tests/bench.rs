@@ -26,7 +26,7 @@ const KINDS: [(&str, &str); 6] = [
     ("event", "copy"),
 ];
 
-/// Two processes cannot poll for each other on one CPU.
+/// Returns whether there are two CPUs: two processes cannot poll for each other on one.
 fn has_two_cpus() -> bool {
     let enough = available_parallelism().is_ok_and(|cpus| cpus.get() > 1);
     if !enough {
@@ -40,7 +40,8 @@ fn rows(document: &Value, part: &str) -> Vec<Value> {
     document[part].as_array().unwrap_or_else(|| panic!("{part} is a list")).clone()
 }
 
-/// All percentiles of the best round and of all together, in order, and how often it was measured.
+/// Checks all percentiles of the best round and of all together, which must be in order, and the number of
+/// measurements.
 fn check_times(times: &Value) {
     assert!(times["median_of_p50_ns"].is_f64(), "{times}");
     assert!(times["cpu_ns_a_message"].as_f64() > Some(0.0), "{times}");

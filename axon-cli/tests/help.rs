@@ -88,7 +88,7 @@ fn acl_says_how_access_rules_are_written_tried_and_taken() {
     }
 }
 
-/// Each command that `--help` names, with those below it.
+/// Returns each command that `--help` names, with its subcommands.
 fn commands() -> Vec<String> {
     let below = |command: &[&str]| -> Vec<String> {
         let text = help(command);

@@ -47,7 +47,7 @@ fn nothing_that_a_command_says_steers_a_terminal() {
     assert!(stderr.chars().all(|c| c == '\n' || !c.is_control()), "{stderr:?}");
 }
 
-/// A log whose last tenth was not written.
+/// Creates a log whose last tenth was not written.
 fn log_without_its_end() -> tempfile::NamedTempFile {
     let whole = std::fs::read(LOG).expect("the log");
     let file = tempfile::NamedTempFile::new().expect("temporary file");
@@ -55,7 +55,7 @@ fn log_without_its_end() -> tempfile::NamedTempFile {
     file
 }
 
-/// A log whose last chunk has a wrong checksum.
+/// Creates a log whose last chunk has a wrong checksum.
 fn log_with_a_wrong_checksum() -> tempfile::NamedTempFile {
     const MAGIC: usize = 8;
     const CHUNK: u8 = 6;
@@ -168,7 +168,7 @@ enum End {
     Count,
 }
 
-/// More messages come than may wait while an `axon echo` is stopped.
+/// Checks an `axon echo` that is stopped while more messages come than may wait.
 fn assert_echo_says_what_it_missed(end: End) {
     let host = Host::new();
     let count = ["--count", "2500"];

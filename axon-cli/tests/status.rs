@@ -9,7 +9,7 @@ use std::{fs, os::unix::fs::PermissionsExt as _, path::Path, process::Output};
 
 use common::{Host, Running, eventually};
 
-/// A file of a test.
+/// Writes a file of a test.
 fn file(dir: &Path, name: &str, text: &str, mode: u32) -> String {
     let path = dir.join(name);
     fs::write(&path, text).expect("written");
@@ -43,7 +43,7 @@ impl Pki {
         }
     }
 
-    /// The settings of a host with this certificate, or with another CA or certificate.
+    /// Returns the settings of a host with this certificate, or with another CA or certificate.
     fn settings(&self, ca: &str, cert: &str) -> Vec<(&'static str, String)> {
         vec![
             ("AXON_CLASSIC_AUTH", "ca".to_owned()),

@@ -103,7 +103,7 @@ fn trust_scan_of_a_silent_target_prints_no_key() {
     assert!(stderr.contains("no key was shown") && stderr.contains("127.0.0.1"), "{stderr}");
 }
 
-/// A server that speaks QUIC, and is no daemon.
+/// Starts a server that speaks QUIC and is not a daemon.
 fn serve(runtime: &tokio::runtime::Runtime, config: quinn::ServerConfig) -> String {
     let _entered = runtime.enter();
     let server = quinn::Endpoint::server(config, ([127, 0, 0, 1], 0).into()).expect("endpoint");

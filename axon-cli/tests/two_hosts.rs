@@ -18,7 +18,7 @@ fn play_with(host: &Host, rate: &str, qos: &str) -> Running {
     Running::start(host.axon(&["play", LOG, "--rate", rate, "--wait", "1", "--qos", qos]))
 }
 
-/// An `echo` with these policies for each topic of the log, that stays.
+/// Starts an `echo` with these policies for each topic of the log, which stays.
 fn echo_all(host: &Host, qos: &str) -> [Running; 3] {
     ["/scan", "/odom", "/tf"]
         .map(|topic| Running::start(host.axon(&["echo", topic, "--qos", qos, "--json"])))

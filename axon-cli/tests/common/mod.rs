@@ -47,7 +47,7 @@ impl fmt::Debug for Stderr {
 pub(crate) const LOG: &str =
     concat!(env!("CARGO_MANIFEST_DIR"), "/../examples/data/mit-csail.mcap");
 
-/// The tool under no setting of AXON or ROS but `settings`.
+/// Returns the command of the tool, with no settings of AXON or ROS except `settings`.
 pub(crate) fn axon<'a>(settings: impl IntoIterator<Item = (&'a str, &'a str)>) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_axon"));
     for (name, _) in std::env::vars_os() {
@@ -74,7 +74,7 @@ impl Host {
         Self::at("127.0.0.1".to_owned(), None, Self::domain())
     }
 
-    /// Two hosts that list each other.
+    /// Creates two hosts that list each other.
     pub(crate) fn pair() -> [Self; 2] {
         let (net, domain) = (1 + std::process::id() % 250, Self::domain());
         let [a, b] = [1, 2].map(|host| format!("127.9.{net}.{host}"));
@@ -87,8 +87,8 @@ impl Host {
         Self { dir, domain, address, peer }
     }
 
-    /// Tests run at the same time, and daemons outlive them by their grace time: each package's tests
-    /// have a range of domains to themselves, as has the demo.
+    /// Returns a domain. Tests run at the same time, and daemons outlive them by their grace time, so each package's
+    /// tests have a range of domains of their own, as has the demo.
     fn domain() -> String {
         static NEXT: AtomicU32 = AtomicU32::new(0);
         let number = std::process::id().wrapping_mul(7) + NEXT.fetch_add(1, Ordering::Relaxed);
@@ -107,7 +107,7 @@ impl Host {
         command
     }
 
-    /// A session of this process with the daemon of the host, which runs already.
+    /// Opens a session of this process with the daemon of the host, which runs already.
     pub(crate) fn session(&self, name: &str) -> axon_transport::Session {
         let config = axon_transport::config::Config::builder()
             .runtime_dir(self.dir.path())
@@ -127,14 +127,14 @@ impl Host {
         output.status.success().then(|| serde_json::from_slice(&output.stdout).expect("JSON"))
     }
 
-    /// Messages that are published here.
+    /// Returns the number of messages that are published here.
     pub(crate) fn published(&self) -> u64 {
         let Some(status) = self.status() else { return 0 };
         let topics = status["topics"].as_array().expect("topics");
         topics.iter().map(|topic| topic["published"].as_u64().expect("a count")).sum()
     }
 
-    /// The process id of the daemon.
+    /// Returns the process id of the daemon.
     pub(crate) fn daemon(&self) -> Option<i32> {
         let pid = self.status()?["pid"].as_i64().expect("a process id");
         Some(i32::try_from(pid).expect("a process id"))
@@ -210,7 +210,7 @@ impl Echoes {
         }))
     }
 
-    /// Every message came, once and in order.
+    /// Checks that every message came, once and in order.
     pub(crate) fn assert_whole(self) {
         for (mut echo, count) in self.0 {
             let sequences: Vec<u64> = echo.lines().map(|line| sequence(&line)).collect();
