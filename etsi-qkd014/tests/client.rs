@@ -88,7 +88,7 @@ async fn a_kme_with_another_id_or_name_is_refused() {
     assert!(by_wrong_id.status("sae-b").await.is_err());
 }
 
-/// KMEs whose certificates name 0.0.0.0 and no address that a client could use.
+/// Starts KMEs whose certificates name 0.0.0.0 and no address that a client could use.
 async fn two_on_all_addresses(_not: u16) -> Network {
     Network::builder()
         .strict()

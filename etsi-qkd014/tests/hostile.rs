@@ -23,7 +23,7 @@ fn kme_a(network: &Network) -> &Kme {
     network.kme("kme-a").unwrap()
 }
 
-/// One key asked of a KME with a fault.
+/// Requests one key of a KME with a fault, and returns the error.
 async fn enc(fault: Fault, setting: impl FnOnce(ClientBuilder) -> ClientBuilder) -> Error {
     let network = network().await;
     let client = setting(once(&network)).build().unwrap();

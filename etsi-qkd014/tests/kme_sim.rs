@@ -41,7 +41,7 @@ fn wrong_arguments_end_with_status_2_and_create_nothing() {
     assert_eq!(kme_sim().args(["run", dir]).output().unwrap().status.code(), Some(1));
 }
 
-/// A port that was free a moment ago.
+/// Returns a port that was free a moment ago.
 fn port(address: &str) -> u16 {
     TcpListener::bind((address, 0)).unwrap().local_addr().unwrap().port()
 }
@@ -98,7 +98,7 @@ async fn the_environment_it_prints_serves_a_client() {
     assert!(master.enc_keys("sae-b").send().await.is_err(), "one key was stored");
 }
 
-/// `kme-sim init` of two KMEs at free ports; what it printed.
+/// Runs `kme-sim init` for two KMEs at free ports, and returns its output.
 fn init(certs: &Path) -> String {
     let a = format!("kme-a=127.0.0.1:{}=sae-a", port("127.0.0.1"));
     let b = format!("kme-b=127.0.0.2:{}=sae-b", port("127.0.0.2"));

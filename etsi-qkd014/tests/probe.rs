@@ -32,7 +32,7 @@ impl Site {
         self.network.sae(sae).unwrap().env(self.dir.path())
     }
 
-    /// With `faults` at the master's KME.
+    /// Runs the probe with `faults` at the master's KME.
     fn probe(&self, faults: &[&str], args: &[&str]) -> (bool, String) {
         let kme = self.network.kme("kme-a").unwrap();
         kme.clear_faults();
@@ -41,7 +41,7 @@ impl Site {
     }
 }
 
-/// The lines of a table that end with this verdict.
+/// Returns the lines of a table that end with this verdict.
 fn verdicts<'t>(table: &'t str, verdict: &str) -> Vec<&'t str> {
     table.lines().filter(|line| line.trim_end().ends_with(verdict)).collect()
 }
@@ -110,7 +110,7 @@ async fn a_deviation_with_a_quirk_is_named_by_it() {
 }
 
 impl Site {
-    /// The slave's environment as `kme-sim init` prints it.
+    /// Returns the slave's environment as `kme-sim init` prints it.
     fn slave_env(&self) -> String {
         probing::env_file(self.dir.path(), &["sae-a", "sae-b"].map(|sae| self.env(sae)))
     }

@@ -215,7 +215,7 @@ async fn simulated(fault: &str) -> Probed {
     tokio::task::block_in_place(|| run(dir.path(), envs))
 }
 
-/// `None` without Python.
+/// Probes the KME in Python. Returns `None` without Python.
 fn in_python(options: &[&str]) -> Option<Probed> {
     let dir = tempfile::tempdir().unwrap();
     let layout = Layout { sites: sites() };

@@ -14,7 +14,7 @@ struct Pair {
     server: Server,
 }
 
-/// `kme-x` does not run: `sae-x` is certified, and attached to neither of the others.
+/// Creates the certificates. `kme-x` does not run: `sae-x` is certified, and attached to neither of the others.
 fn pki() -> Pki {
     let site = |kme: &str, ip: [u8; 4], saes: &[&str]| Site {
         kme: kme.to_owned(),

@@ -35,8 +35,8 @@ impl Account {
         Ok(Self { id, certs, url })
     }
 
-    /// The account in the environment, or `None` with the reason on standard error: past the
-    /// harness, which would show it only beside a failure.
+    /// Returns the account in the environment, or `None` with the reason on standard error. The reason bypasses the
+    /// harness, which would show it only with a failure.
     fn here() -> Option<Self> {
         let read = Self::read(|name| std::env::var(name).ok());
         read.inspect_err(|why| {
@@ -45,7 +45,7 @@ impl Account {
         .ok()
     }
 
-    /// A client that is SAE `n` at KME `n`.
+    /// Returns a client that is SAE `n` at KME `n`.
     fn client(&self, n: u8) -> Client {
         Client::builder()
             .kme_url(self.url.replace("{n}", &n.to_string()))
@@ -82,7 +82,7 @@ async fn keys_are_the_same_at_both_ends(account: &Account) {
     }
 }
 
-/// Clause 5.4: keys that were given are removed.
+/// Clause 5.4: checks that keys are removed once they were given.
 async fn a_key_is_given_once(account: &Account) {
     let (master, slave) = (account.client(1), account.client(2));
     let key = master.enc_keys("sae-2").send().await.unwrap().into_single();
@@ -91,7 +91,7 @@ async fn a_key_is_given_once(account: &Account) {
     assert!(again.is_err(), "the KME gave one key twice");
 }
 
-/// Clause 5.4: 401 for an SAE that the key was not drawn for.
+/// Clause 5.4: checks that an SAE for which the key was not drawn gets 401.
 async fn a_key_is_not_for_its_master_to_draw_again(account: &Account) {
     let master = account.client(1);
     let key = master.enc_keys("sae-2").send().await.unwrap().into_single();
@@ -135,7 +135,7 @@ fn missing_account_settings_are_named() {
     assert_eq!(url, "https://kme-{n}.acct-1234.etsi-qkd-api.qukaydee.com");
 }
 
-/// Two simulated KMEs and the files of an account, in QuKayDee's layout.
+/// Starts two simulated KMEs, and writes the files of an account in QuKayDee's layout.
 async fn stand_in() -> (Network, tempfile::TempDir, Account) {
     loop {
         // The URL has a place for the KME's number only, so both listen on the same port.

@@ -20,7 +20,7 @@ async fn network() -> Network {
         .unwrap()
 }
 
-/// An SAE that calls this KME, its own or not.
+/// Returns a client of an SAE for this KME, which may be its own or not.
 fn at(network: &Network, sae: &Sae, kme: &str) -> Client {
     let url = network.kme(kme).unwrap().url();
     let builder = sae.client_builder().kme_url(url).kme_id(kme);

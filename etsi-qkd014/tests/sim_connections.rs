@@ -22,7 +22,7 @@ const CONNECTIONS: usize = 250;
 const MINUTE: Duration = Duration::from_secs(60);
 
 impl Killed {
-    /// `kme-sim run` with these arguments behind the directory's, and the address of its one KME.
+    /// Starts `kme-sim run` with these arguments behind the directory's. Also returns the address of its one KME.
     fn start(dir: &Path, limits: &str, arguments: &[&str]) -> (Self, SocketAddr) {
         let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
         let addr: SocketAddr = ([127, 0, 0, 1], port).into();
@@ -41,12 +41,12 @@ impl Killed {
         (run, addr)
     }
 
-    /// Open files and sockets.
+    /// Returns the number of open files and sockets.
     fn files(&self) -> usize {
         std::fs::read_dir(format!("/proc/{}/fd", self.0.id())).unwrap().count()
     }
 
-    /// Resident memory, KiB.
+    /// Returns the resident memory in KiB.
     fn memory(&self) -> u64 {
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.0.id())).unwrap();
         let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:")).unwrap();
@@ -54,7 +54,7 @@ impl Killed {
     }
 }
 
-/// A client of its own connections that asks once.
+/// Returns a client with its own connections that calls once.
 fn client(dir: &Path, addr: SocketAddr) -> Client {
     Client::builder()
         .kme_url(format!("https://{addr}"))
@@ -69,7 +69,7 @@ fn client(dir: &Path, addr: SocketAddr) -> Client {
         .unwrap()
 }
 
-/// A part of the connections. Where no more files may be open here, as many as there are.
+/// Opens a part of the connections, or as many as this process may open.
 fn flood(addr: SocketAddr) -> Vec<TcpStream> {
     let mut open = Vec::new();
     for _ in 0..CONNECTIONS {

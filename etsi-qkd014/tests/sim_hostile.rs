@@ -23,7 +23,7 @@ async fn network() -> Network {
     builder().strict().start().await.unwrap()
 }
 
-/// A client that asks once and has a minute for it.
+/// Returns a client that calls once, with a limit of a minute.
 fn client(network: &Network) -> Client {
     let builder = network.client_builder("sae-c").retry(RetryPolicy::none());
     let minute = Duration::from_secs(60);

@@ -170,7 +170,7 @@ async fn a_kme_passes_over_nulls_and_members_that_the_specification_does_not_lis
     assert_eq!(exchange(&strict, "sae-a", get).await.status, 400);
 }
 
-/// A POST without a length, whose body is `pieces`, each a chunk.
+/// Returns a POST without a length, whose body is `pieces`, each a chunk.
 fn chunked(path: &str, pieces: &[&str]) -> String {
     let mut text = format!(
         "POST /api/v1/keys/{path} HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n\

@@ -39,7 +39,7 @@ impl Material {
         Self { ca, kme: (cert, key.serialize_pem()), issuer }
     }
 
-    /// A certificate for a private key in PKCS#8.
+    /// Issues a certificate for a private key in PKCS#8.
     fn sae(&self, pkcs8_pem: &str) -> String {
         let key = KeyPair::from_pem(pkcs8_pem).unwrap();
         CertificateParams::default().signed_by(&key, &self.issuer).unwrap().pem()
@@ -318,7 +318,7 @@ async fn a_short_retry_after_is_waited_for() {
     assert_eq!(kme.counters().status_calls, 2);
 }
 
-/// The DER inside of PKCS#8: SEC1 for elliptic curves, PKCS#1 for RSA.
+/// Returns the DER inside of PKCS#8: SEC1 for elliptic curves, PKCS#1 for RSA.
 fn inner_der(pkcs8: &[u8]) -> Vec<u8> {
     // SEQUENCE { version, algorithm, OCTET STRING { the key } }
     let (_, mut content, _) = element(pkcs8);
@@ -331,7 +331,7 @@ fn inner_der(pkcs8: &[u8]) -> Vec<u8> {
     last.1.to_vec()
 }
 
-/// Tag, content and what follows.
+/// Returns tag and content of an element, and the bytes after it.
 fn element(der: &[u8]) -> (u8, &[u8], &[u8]) {
     let (header, length) = match der[1] {
         short @ 0..=0x7f => (2, usize::from(short)),

@@ -8,7 +8,7 @@ use std::time::Duration;
 use etsi_qkd014::RetryPolicy;
 use etsi_qkd014::sim::{Fault, Network};
 
-/// The outcome, or `None` where it was dropped instead of being polled for the next time.
+/// Polls a call at most `most` times. Returns the outcome, or `None` if the call was dropped before.
 async fn polled<T>(call: impl Future<Output = T>, most: usize) -> Option<T> {
     let mut call = pin!(call);
     let mut left = most;

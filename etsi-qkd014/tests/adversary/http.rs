@@ -6,7 +6,7 @@ use etsi_qkd014::Error;
 
 use crate::server::{KEY, Server, Then, answer, container, ok};
 
-/// One `enc_keys` for one key, in a second.
+/// Calls `enc_keys` for one key, with a limit of a second.
 async fn enc(answer: Vec<u8>, then: Then) -> Result<(), Error> {
     let server = Server::start(answer, then).await;
     let client = server.client().timeout(Duration::from_secs(1)).build().unwrap();
@@ -15,7 +15,7 @@ async fn enc(answer: Vec<u8>, then: Then) -> Result<(), Error> {
     Ok(())
 }
 
-/// The call fails, its keys are in doubt, and no key is told.
+/// Checks that the call fails, that its keys are in doubt, and that the error reveals no key.
 async fn in_doubt(answer: Vec<u8>, then: Then) -> Error {
     let error = enc(answer, then).await.unwrap_err();
     assert!(error.keys_may_be_consumed(), "{error}");

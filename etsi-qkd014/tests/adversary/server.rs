@@ -15,19 +15,19 @@ use rustls::{ServerConfig, ServerConnection, StreamOwned};
 pub(crate) const ID: &str = "bc490419-7d60-487f-adc1-4ddcc177c139";
 pub(crate) const KEY: &str = "wHHVxRwDJs3/bXd38GHP3oe4svTuRpZS0yCC7x4Ly+s=";
 
-/// A container with one key.
+/// Returns a container with one key.
 pub(crate) fn container() -> String {
     format!(r#"{{"keys":[{{"key_ID":"{ID}","key":"{KEY}"}}]}}"#)
 }
 
-/// A whole answer, with further lines in its head.
+/// Returns a whole answer, with further lines in its head.
 pub(crate) fn answer(status: &str, more: &str, body: &[u8]) -> Vec<u8> {
     let length = body.len();
     let head = format!("HTTP/1.1 {status}\r\n{more}Content-Length: {length}\r\n\r\n");
     [head.as_bytes(), body].concat()
 }
 
-/// An answer of status 200 in JSON.
+/// Returns an answer of status 200 in JSON.
 pub(crate) fn ok(body: &[u8]) -> Vec<u8> {
     answer("200 OK", "Content-Type: application/json\r\n", body)
 }
@@ -83,7 +83,7 @@ impl Server {
         Self { settings: Box::new(settings), connections, heads }
     }
 
-    /// Settings of a client that calls once.
+    /// Returns settings of a client that calls once.
     pub(crate) fn client(&self) -> ClientBuilder {
         (self.settings)()
     }
@@ -92,7 +92,7 @@ impl Server {
         self.connections.load(Ordering::SeqCst)
     }
 
-    /// The heads of the requests, in lower case.
+    /// Returns the heads of the requests, in lower case.
     pub(crate) fn heads(&self) -> Vec<String> {
         self.heads.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
@@ -112,7 +112,7 @@ fn tls(dir: &std::path::Path) -> Arc<ServerConfig> {
 
 type Stream = StreamOwned<ServerConnection, std::net::TcpStream>;
 
-/// An error ends the connection: the client has gone.
+/// Serves a connection. An error ends it: the client has gone.
 fn serve(
     mut stream: Stream,
     answer: &[u8],

@@ -43,7 +43,7 @@ impl Drop for Scripted {
     }
 }
 
-/// The n-th UUID.
+/// Returns the n-th UUID.
 pub(crate) fn uuid(n: u64) -> String {
     format!("00000000-0000-4000-8000-{n:012x}")
 }

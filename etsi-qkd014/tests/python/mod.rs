@@ -9,7 +9,7 @@ use std::process::{Child, Command, Output, Stdio};
 
 const DIR: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/python");
 
-/// Python 3.8 or later, or `None` with the reason on standard error.
+/// Returns Python 3.8 or later, or `None` with the reason on standard error.
 fn python() -> Option<Command> {
     let probe = "import sys, ssl; sys.exit(sys.version_info < (3, 8))";
     let found = Command::new("python3").args(["-c", probe]).output();
@@ -43,12 +43,12 @@ pub(crate) struct Server {
 }
 
 impl Server {
-    /// `sites` as `kme.py` takes them: `KME=ADDRESS=SAE,SAE`.
+    /// Starts the KMEs. `kme.py` takes `sites` in the form `KME=ADDRESS=SAE,SAE`.
     pub(crate) fn start(dir: &Path, stored: u32, sites: &[&str]) -> Option<Self> {
         Self::wrong(&[], dir, stored, sites)
     }
 
-    /// With options of `kme.py` that make it wrong.
+    /// Starts the KMEs with options of `kme.py` that make it wrong.
     pub(crate) fn wrong(options: &[&str], dir: &Path, stored: u32, sites: &[&str]) -> Option<Self> {
         let mut command = python()?;
         command.arg("kme.py").args(options).arg(dir).arg(stored.to_string()).args(sites);

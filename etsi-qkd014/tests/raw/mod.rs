@@ -14,7 +14,7 @@ use tokio::net::TcpStream;
 use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
 
-/// A TLS connection to the KME of an SAE, with that SAE's certificate.
+/// Opens a TLS connection to the KME of an SAE, with that SAE's certificate.
 pub(crate) async fn connect(network: &Network, sae: &str) -> Connection {
     let sae = network.sae(sae).unwrap();
     let addr = network.kme(sae.kme_id()).unwrap().addr();
@@ -64,7 +64,7 @@ impl Connection {
         self.stream.flush().await
     }
 
-    /// The next answer; `None` where the connection is closed before one.
+    /// Reads the next answer; `None` if the connection is closed before one.
     pub(crate) async fn answer(&mut self) -> Option<Answer> {
         let (head, length) = loop {
             let text = String::from_utf8_lossy(&self.unread);
@@ -88,7 +88,7 @@ impl Connection {
     }
 }
 
-/// A POST as most clients write it.
+/// Returns a POST as most clients write it.
 pub(crate) fn post(path: &str, body: &str) -> String {
     let length = body.len();
     format!(

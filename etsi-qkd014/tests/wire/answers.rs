@@ -17,7 +17,7 @@ async fn enc(answer: ResponseTemplate, number: u32) -> Result<KeyContainer, Erro
     client.enc_keys("sae-b").number(number).size(256).send().await
 }
 
-/// The call fails after its keys may have been consumed, and no key is told.
+/// Checks that the call fails after its keys may have been consumed, and that the error reveals no key.
 async fn in_doubt(answer: ResponseTemplate, number: u32) -> Error {
     let error = enc(answer, number).await.err().expect("the answer must not be taken");
     assert!(error.keys_may_be_consumed(), "{error}");

@@ -23,12 +23,12 @@ use wiremock::{Mock, MockServer, ResponseTemplate};
 pub(crate) const ID: &str = "bc490419-7d60-487f-adc1-4ddcc177c139";
 pub(crate) const KEY: &str = "wHHVxRwDJs3/bXd38GHP3oe4svTuRpZS0yCC7x4Ly+s=";
 
-/// A container with one key.
+/// Returns a container with one key.
 pub(crate) fn container() -> String {
     format!(r#"{{"keys":[{{"key_ID":"{ID}","key":"{KEY}"}}]}}"#)
 }
 
-/// An answer of status 200 in JSON.
+/// Returns an answer of status 200 in JSON.
 pub(crate) fn ok(body: impl Into<Vec<u8>>) -> ResponseTemplate {
     ResponseTemplate::new(200).set_body_raw(body, "application/json")
 }
@@ -41,7 +41,7 @@ pub(crate) struct Kme {
 }
 
 impl Kme {
-    /// One that answers 404 to all that no mock matches.
+    /// Starts a KME that answers 404 to every request that no mock matches.
     pub(crate) async fn start() -> Self {
         let network = Network::builder()
             .kme("kme-a", "127.0.0.1:0".parse().unwrap(), ["sae-a"])
@@ -61,7 +61,7 @@ impl Kme {
         Self { mock, network, url, front }
     }
 
-    /// One that gives this answer, of status 200 in JSON, to everything.
+    /// Starts a KME that gives this answer, of status 200 in JSON, to every request.
     pub(crate) async fn answering(body: &[u8]) -> Self {
         let kme = Self::start().await;
         kme.mount(ok(body)).await;
@@ -73,7 +73,7 @@ impl Kme {
         Mock::given(any()).respond_with(answer).mount(&self.mock).await;
     }
 
-    /// Settings of a client that calls once.
+    /// Returns settings of a client that calls once.
     pub(crate) fn client(&self) -> ClientBuilder {
         self.network.client_builder("sae-a").kme_url(&self.url).retry(RetryPolicy::none())
     }
