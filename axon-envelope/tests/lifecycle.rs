@@ -23,7 +23,7 @@ fn open(opener: &mut Opener, now: Duration, envelope: &[u8]) -> Result<(), Refus
     }
 }
 
-/// Six messages, best effort and reliable in turn: reliable are 1, 3 and 5.
+/// Seals six messages, best effort and reliable in turn: 1, 3 and 5 are reliable.
 fn six(name: &str) -> (Vec<Vec<u8>>, Sealer) {
     let mut sealer = sealer(name, 1);
     let deliveries = [Delivery::BestEffort, Delivery::Reliable].into_iter().cycle().take(6);

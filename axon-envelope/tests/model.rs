@@ -76,7 +76,7 @@ fn step() -> impl Strategy<Value = Step> {
     ]
 }
 
-/// Milliseconds, among them those that end right before, at and after each time limit.
+/// Generates milliseconds, including times right before, at and after each time limit.
 fn pass() -> impl Strategy<Value = u32> {
     let edge = |limit: Duration| {
         let limit = limit.as_millis() as u32;
@@ -405,7 +405,7 @@ impl World {
         self.opener = next;
     }
 
-    /// The receiver has lost all memory. Even the keys it is given again must not open the past.
+    /// Makes the receiver lose all memory. Even the keys that it is given again must not open earlier messages.
     fn receiver_restart(&mut self) {
         self.connection += 1;
         self.sealer = None;

@@ -131,7 +131,7 @@ fn opener() -> Opener<Recorded> {
     opener
 }
 
-/// Every way to be refused, on an [`opener`].
+/// Returns every way to be refused, on an [`opener`].
 fn refused() -> Vec<(&'static str, RefusalCause, Vec<u8>)> {
     use RefusalCause::*;
 
@@ -178,7 +178,7 @@ fn refused() -> Vec<(&'static str, RefusalCause, Vec<u8>)> {
     ]
 }
 
-/// The texts that a program which prints or passes on the error gives away.
+/// Returns the texts that a program which prints or passes on the error reveals.
 fn aloud(error: &OpenError) -> (String, String) {
     assert!(std::error::Error::source(error).is_none());
     (error.to_string(), format!("{error:?} {error:#?}"))

@@ -189,7 +189,7 @@ fn python(command: &str, input: &[u8]) -> Option<Vec<u8>> {
     Some(output.stdout)
 }
 
-/// Messages of every kind, index and a range of lengths, each under a channel of its own.
+/// Returns messages of every kind, index and a range of lengths, each under a channel of its own.
 fn cases() -> Vec<Case> {
     let lengths = [0, 1, 15, 16, 17, 64, 1_000, 70_000];
     let mut cases = Vec::new();

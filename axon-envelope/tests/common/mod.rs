@@ -24,7 +24,7 @@ pub(crate) fn sealer(name: &str, byte: u8) -> Sealer {
     Sealer::new(&channel(), key_id(name), key(byte)).unwrap()
 }
 
-/// An opener on [`channel`] that holds one key.
+/// Creates an opener on [`channel`] that holds one key.
 pub(crate) fn opener(name: &str, byte: u8) -> Opener {
     let mut opener = Opener::new(channel()).unwrap();
     opener.add_key(key_id(name), key(byte)).unwrap();
