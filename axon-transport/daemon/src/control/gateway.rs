@@ -100,7 +100,7 @@ impl RunningGateway {
                 control.borrow_mut().gateway_says(event);
                 Ok(())
             }
-            // It closed the channel before it ended: the end has the reason.
+            // The gateway closed the channel before it ended: the end has the reason.
             Ok(Err(why)) if why.is_empty() => {
                 Err((&mut self.end).await.unwrap_or_else(|_| "ended".into()))
             }

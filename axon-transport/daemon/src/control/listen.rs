@@ -372,7 +372,7 @@ fn admit(
         return None;
     }
     if is_crowded {
-        // There are descriptors again: the session connects again.
+        // Descriptors are free again, so the session connects again.
         return None;
     }
     let checked =

@@ -7,7 +7,7 @@ use super::order::Side;
 /// A connection that completed its HELLOs (and proof).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Candidate {
-    /// Which end this side is.
+    /// The side of this daemon.
     pub side: Side,
     /// Whether the connection is the successor of a link that is up (for a new key or a new address).
     pub successor: bool,

@@ -5,12 +5,12 @@
 
 use crate::wire::{keys::KeyMessage, link::LinkMessage};
 
-/// Which end of the TLS handshake this side is.
+/// The side of the TLS handshake.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Side {
-    /// It dialled.
+    /// The side that dialled.
     Client,
-    /// It was dialled.
+    /// The side that was dialled.
     Server,
 }
 

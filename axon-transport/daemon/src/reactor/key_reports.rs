@@ -1,4 +1,5 @@
-//! When the counters of the keys are read for status: on another thread, since the ledger may wait for the disk.
+//! Schedules reads of the counters of the keys for status. They happen on another thread, since the ledger may wait for
+//! the disk.
 
 use std::time::Duration;
 

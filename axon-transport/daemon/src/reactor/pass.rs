@@ -55,7 +55,7 @@ pub(super) struct ReactorParts {
     pub(super) engine: Engine,
     /// Whether the reactor looks for inputs before it sleeps.
     pub(super) poll: LinkPoll,
-    /// When the engine's time was zero.
+    /// The instant of the engine's time zero.
     pub(super) epoch: Instant,
     pub(super) sockets: Sockets,
     pub(super) rings: Rc<ShmRings>,
@@ -435,7 +435,7 @@ async fn watch_files(identity: Arc<Identity>, report: mpsc::UnboundedSender<Task
     while !report.is_closed() {
         looks.tick().await;
         let identity = Arc::clone(&identity);
-        // On another thread: a file system can hang.
+        // The work runs on another thread, because a file system can hang.
         let changed = spawn_blocking(move || identity.look(Instant::now())).await;
         if changed.unwrap_or(false) && report.send(TaskResult::Identity).is_err() {
             return;

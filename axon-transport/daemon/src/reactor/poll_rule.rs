@@ -20,11 +20,11 @@ const SKIPPED_PASSES: (u32, u32) = (64, 4096);
 /// The reactor's action after a pass.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum PollDecision {
-    /// It sleeps.
+    /// The reactor sleeps.
     Not,
-    /// It looks for so long, and then sleeps.
+    /// The reactor looks for this time, and then sleeps.
     For(Duration),
-    /// It looks until there is an input.
+    /// The reactor looks until there is an input.
     On,
 }
 
@@ -114,7 +114,7 @@ mod tests {
         let mut adaptive = PollRule::new(LinkPoll::Adaptive, 2);
         assert_eq!(looks(&mut adaptive, 10_000, |_| true), 10_000);
         assert_eq!(looks(&mut adaptive, 10_000, |pass| pass % MIN_HIT_DIVISOR == 0), 10_000);
-        // It notices that they stopped, and soon that they began again.
+        // The rule notices that the inputs stopped, and soon that they began again.
         assert!(looks(&mut adaptive, 100, |_| false) < 50);
         assert!(looks(&mut adaptive, 1_000, |_| true) > 800);
     }

@@ -138,7 +138,7 @@ impl RingReader for RelayReader {
         }
         let (samples, payloads) = (taken.len(), Bytes::from(payloads));
         if let [(info, _)] = taken[..] {
-            // It shares its memory with no other.
+            // The sample shares its memory with no other.
             each(info, payloads);
         } else {
             taken.iter().for_each(|(info, at)| each(*info, payloads.slice(at.clone())));

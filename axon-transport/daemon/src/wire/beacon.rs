@@ -88,14 +88,14 @@ pub struct Foreign {
     pub daemon: DaemonId,
 }
 
-/// Why bytes are no discovery datagram.
+/// The reason why bytes are not a discovery datagram.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum DatagramError {
     /// More than [`LONGEST`] bytes.
     #[error("{0} bytes, at most 512 are accepted")]
     TooLong(usize),
-    /// It does not begin as one.
+    /// The bytes do not begin as a discovery datagram.
     #[error("not a discovery datagram")]
     Magic,
     /// A kind that this version does not know.

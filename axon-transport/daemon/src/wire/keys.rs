@@ -49,7 +49,7 @@ pub enum KeyMessage {
     },
 }
 
-/// Why bytes are no key announcement.
+/// The reason why bytes are not a key announcement.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum MessageError {

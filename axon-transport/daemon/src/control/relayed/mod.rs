@@ -189,7 +189,7 @@ struct RelayedSession {
     left: VecDeque<(Gid, Gid)>,
     /// The rate limit of log lines about pairs in `left` that were given up.
     given_up: LogLimit,
-    /// When the session began: leases and log lines count from there.
+    /// The time at which the session began, from which leases and log lines count.
     begun: Instant,
     leader: ExternalLeader,
     change_signal: Arc<ChangeSignal>,
@@ -331,7 +331,7 @@ impl RelayedSession {
             self.losses.add(topic, ENDED, *samples);
         }
         let samples: u64 = topics.values().sum();
-        // One line, however many topics it had.
+        // This logs one line for all topics.
         if let Some((topic, most)) = topics.iter().max_by_key(|(_, samples)| **samples) {
             let others = topics.len() - 1;
             tracing::warn!(
@@ -358,7 +358,7 @@ impl RelayedSession {
                 self.pipe.say(&SessionMessage::EndpointGone(gone))
             }
             SessionMessage::Leaving(WriterLeaving { gid, leaving }) => {
-                // It may have been refused.
+                // The writer may have been refused.
                 if let Some(remote_writer) = self.writers.get(&gid) {
                     remote_writer.leave(leaving);
                 }

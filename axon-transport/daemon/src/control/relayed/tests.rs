@@ -92,7 +92,7 @@ fn a_relayed_process_receives_the_control_planes_refusal() {
         });
         assert_eq!(refused.endpoint, Some(gid), "{kind:?}");
         assert!(refused.text.contains("there are enough"), "{}", refused.text);
-        // It is given up here, too.
+        // The session also gives the endpoint up.
         hear(&control, |message| {
             matches!(message, SessionMessage::EndpointGone(gone) if gone.gid == gid).then_some(())
         });

@@ -216,7 +216,7 @@ mod tests {
         PublisherDrains::new(1000)
     }
 
-    /// A measure for tests in which the length of samples does not matter.
+    /// Returns 0, for tests in which the length of samples does not matter.
     fn no_bytes(_: u32, _: &Gid) -> u64 {
         0
     }

@@ -214,7 +214,7 @@ mod tests {
         START + Duration::from_secs(number)
     }
 
-    /// The counts of arrivals, of acknowledgements and of requests.
+    /// Returns the traffic with these counts of arrivals, acknowledgements and requests.
     fn traffic(came: u64, acknowledged: u64, asked: u64) -> Traffic {
         Traffic::of(came, acknowledged, asked)
     }

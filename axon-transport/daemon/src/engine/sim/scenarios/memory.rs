@@ -244,7 +244,7 @@ fn publishers_of_a_topic_are_bounded_over_all_ids_of_an_identity() {
     assert_eq!(world.hosts[0].shown(), 1024, "{}", world.describe());
 }
 
-/// A raw peer with KEEP_ALL relays for `topics` topics is killed, and its next daemon announces the same subscription.
+/// Kills a raw peer with KEEP_ALL relays for `topics` topics; its next daemon announces the same subscription.
 fn restarts(world: &mut World, peer: usize, id: u8, topics: u32) {
     let subscription = endpoint(EndpointKind::Subscription, gid(id, 0), "/moved");
     let graph = GraphUpdate { version: 1, added: vec![subscription], ..GraphUpdate::default() };

@@ -100,8 +100,8 @@ fn long_topic(number: u64) -> String {
     std::iter::once('/').chain(name).collect()
 }
 
-/// A peer that reads nothing asks for the graph of the host over `links` links with different daemon ids, until one is
-/// closed. Returns the maximum number of bytes that waited for it.
+/// Makes a peer that reads nothing ask for the graph of the host over `links` links with different daemon ids, until
+/// one is closed. Returns the maximum number of bytes that waited for it.
 fn most_unread(seed: u64, links: u8) -> usize {
     let mut world = world(seed, 1, Config::default);
     for number in 0..16_000 {
