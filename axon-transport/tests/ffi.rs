@@ -45,7 +45,7 @@ fn has(program: &str) -> bool {
     found
 }
 
-/// The test program, with these flags more.
+/// Builds the test program with these additional flags.
 fn build(directory: &Path, flags: &[&str]) -> PathBuf {
     let program = directory.join("ffi");
     let mut cc = Command::new("cc");
@@ -105,7 +105,7 @@ fn the_header_is_plain_c_and_plain_cpp() {
     }
 }
 
-/// Names of the functions that the library has for C.
+/// Returns the names of the functions that the library has for C.
 fn exported() -> Vec<String> {
     functions().into_iter().map(|(name, _)| name).collect()
 }

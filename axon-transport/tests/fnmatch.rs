@@ -5,7 +5,7 @@ use std::ffi::CString;
 
 use axon_transport::internal::sros2::Expression;
 
-/// All texts of these characters that are no longer than that.
+/// Returns all texts of these characters up to this length.
 fn texts(characters: &str, longest: usize) -> Vec<String> {
     let mut all = vec![String::new()];
     let mut last = all.clone();

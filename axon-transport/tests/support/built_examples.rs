@@ -9,8 +9,8 @@ use std::{
     time::SystemTime,
 };
 
-/// The folder that has the `files` of `examples`. `cargo test` of the workspace builds them; where only one
-/// test is asked for, they are built here. `package` is the folder of `axon-transport`.
+/// Returns the folder with the `files` of `examples`. `cargo test` of the workspace builds them; if only one test is
+/// requested, this function builds them. `package` is the folder of `axon-transport`.
 pub(crate) fn built_examples(package: &Path, examples: &[&str], files: &[&str]) -> PathBuf {
     static BUILDING: Mutex<()> = Mutex::new(());
     let test = std::env::current_exe().unwrap();
@@ -37,7 +37,7 @@ pub(crate) fn built_examples(package: &Path, examples: &[&str], files: &[&str]) 
     folder
 }
 
-/// When the newest file in a directory was changed.
+/// Returns when the newest file in a directory was changed.
 fn newest(directory: &Path) -> SystemTime {
     let entries = fs::read_dir(directory).unwrap().map(|entry| entry.unwrap().path());
     let times = entries.map(|path| match path.is_dir() {

@@ -24,7 +24,7 @@ pub(crate) fn path(within: &str) -> PathBuf {
     here.join(within)
 }
 
-/// A library of the C interface.
+/// Returns the path of a library of the C interface.
 pub(crate) fn library(name: &str) -> PathBuf {
     built_examples(&path(""), &["axon_c"], &[name]).join(name)
 }

@@ -18,7 +18,7 @@ fn poll(future: &mut Pin<&mut impl Future<Output = Received>>, waker: &Waker) ->
     future.as_mut().poll(&mut Context::from_waker(waker))
 }
 
-/// The control thread lets go of the doorbell once no task has waited for a while.
+/// Waits until the control thread releases the doorbell, which it does once no task has waited for a while.
 fn await_silence(session: &Session) {
     until("nobody listens", || session.segment().external_leader().is_ok());
 }
