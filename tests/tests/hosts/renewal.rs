@@ -54,8 +54,8 @@ fn nothing_lost(sent: u64, tally: &Tally) {
     assert_eq!(*tally, Tally { taken: sent, first: 1, last: sent, ..Tally::default() });
 }
 
-/// Maximum age of keys, in seconds, in tests with floods. A link whose key expires and that has no successor is cut, and
-/// its samples are lost without a count. A flood takes so much of a processor that this may happen within a second.
+/// Maximum age of keys, in seconds, in tests with floods. A link whose key expires and that has no successor is cut,
+/// and its samples are lost without a count. A flood takes so much of a processor that this may happen within a second.
 const OF_FLOODS: &str = "3";
 
 /// Checks that samples arrived in order and that missing ones are counted. A superseded link can carry its remaining

@@ -1,5 +1,5 @@
-//! Stubs of the functions of axon-tls that erase the stack. They erase nothing: this process may keep its secrets, because
-//! only the child's memory is searched.
+//! Stubs of the functions of axon-tls that erase the stack. They erase nothing: this process may keep its secrets,
+//! because only the child's memory is searched.
 
 pub(crate) fn erasing_stack<T>(work: impl FnOnce() -> T) -> T {
     work()
