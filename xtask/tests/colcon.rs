@@ -6,7 +6,7 @@ use std::{
     path::{Path, PathBuf},
 };
 
-/// The folders below `folder`, down to `depth`, that hold a `Cargo.toml`. What a build makes is left out.
+/// Returns the folders below `folder`, down to `depth`, that contain a `Cargo.toml`. Build output is left out.
 fn crates_below(folder: &Path, depth: usize) -> Vec<PathBuf> {
     let mut found = Vec::new();
     for entry in fs::read_dir(folder).unwrap() {

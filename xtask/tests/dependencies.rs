@@ -1,4 +1,4 @@
-//! What an application links with a crate, by its normal dependencies.
+//! Tests the crates that an application links with a crate, by its normal dependencies.
 
 use std::{collections::BTreeSet, path::Path, process::Command};
 
@@ -18,7 +18,7 @@ fn brought(package: &str) -> BTreeSet<String> {
     crates
 }
 
-/// Those of them that these rules forbid.
+/// Returns the dependencies that these rules forbid.
 fn forbidden(package: &str, names: &[&str]) -> Vec<String> {
     let is_forbidden = |brought: &String| names.iter().any(|name| brought.starts_with(name));
     brought(package).into_iter().filter(is_forbidden).collect()

@@ -1,4 +1,4 @@
-//! What the features of axon-tls bring along.
+//! Tests the dependencies that the features of axon-tls add.
 
 mod support;
 

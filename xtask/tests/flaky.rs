@@ -28,7 +28,7 @@ fn text(bytes: &[u8]) -> String {
 fn a_test_that_failed_and_then_passed_is_flaky() {
     let dir = tempfile::tempdir().expect("a directory");
     let (first, second) = (dir.path().join("first"), dir.path().join("second"));
-    // As pytest writes its cache.
+    // The text is in the form in which pytest writes its cache.
     let failed = "{\n  \"tests/ros/test_a.py::test_x[1-a b]\": true,\n  \
                   \"tests/ros/test_a.py::test_y\": true,\n  \"tests/ros/test_b.py::test_z\": true\n}";
     fs::write(&first, failed).expect("written");
@@ -66,7 +66,7 @@ fn one_flaky_test_is_shown_and_two_fail_the_run() {
     };
     assert_eq!(report(""), (Some(0), vec![], 0));
     assert_eq!(report("a::b\n"), (Some(0), vec!["a::b".to_owned()], 4));
-    // The same test twice is one test.
+    // A test that is listed twice counts once.
     assert_eq!(report("a::b\na::b\n"), (Some(0), vec!["a::b".to_owned()], 4));
     let two = vec!["a::b".to_owned(), "c::d e".to_owned()];
     assert_eq!(report("c::d e\na::b\n"), (Some(1), two, 5));

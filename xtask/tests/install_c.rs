@@ -1,6 +1,6 @@
-//! What `cargo xtask install-c` installs: programs in C build and run with it as the README of
-//! axon-transport says, linked with either library, and the shared one exports what the header
-//! declares and nothing else.
+//! Tests the installation by `cargo xtask install-c`. Programs in C build and run with it as the README of
+//! axon-transport says, linked with either library. The shared library exports only the functions that the header
+//! declares.
 //!
 //! It builds axon-transport by itself, with other features than the workspace's, so that all that it
 //! depends on may be built once more: `cargo test -p xtask --test install_c -- --include-ignored`.
@@ -15,7 +15,7 @@ use std::process::Command;
 
 use support::{Kept, run, target, with_daemon, workspace};
 
-/// Prints what a session with permissions of an enclave is told.
+/// A program that prints the errors of a session with permissions of an enclave.
 const LIMITED: &str = "#include <axon.h>
 #include <stdio.h>
 int main(void) {
@@ -32,19 +32,19 @@ int main(void) {
 }
 ";
 
-/// What a command prints.
+/// Runs a command and returns its output.
 fn printed(command: &mut Command) -> String {
     String::from_utf8_lossy(&run(command).stdout).into_owned()
 }
 
-/// Where everything was installed.
+/// The directory of the installation.
 struct Installed(tempfile::TempDir);
 
 impl Installed {
     fn new() -> Self {
         let prefix = tempfile::tempdir().unwrap();
         let mut install = Command::new(env!("CARGO_BIN_EXE_xtask"));
-        // What the workspace has built is of use here.
+        // The build of the workspace is reused here.
         install.env("CARGO_TARGET_DIR", target()).args(["install-c"]).arg(prefix.path()).arg("dev");
         run(&mut install);
         Self(prefix)
@@ -65,14 +65,14 @@ impl Installed {
         functions.map(str::to_owned).collect()
     }
 
-    /// What a program finds in the shared library.
+    /// Returns the functions that the shared library exports.
     fn exported(&self) -> BTreeSet<String> {
         let library = self.path("lib/libaxon_transport.so");
         let symbols = printed(Command::new("nm").args(["-D", "--defined-only"]).arg(library));
         symbols.lines().filter_map(|line| line.split(' ').nth(2)).map(str::to_owned).collect()
     }
 
-    /// What pkg-config answers.
+    /// Returns the answer of pkg-config.
     fn asked(&self, options: &[&str]) -> Vec<String> {
         let mut ask = Command::new("pkg-config");
         ask.env("PKG_CONFIG_PATH", self.path("lib/pkgconfig")).args(options).arg("axon-transport");

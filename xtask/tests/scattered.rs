@@ -44,7 +44,7 @@ fn impls(source: &str) -> Vec<(String, usize)> {
 
 /// The structs of a crate with more than [`LINES`] of methods in several files.
 fn scattered(of: &str) -> BTreeSet<String> {
-    // Not the tests, and not the simulator.
+    // Tests and the simulator are left out.
     let files = rust_sources(&workspace().join(of), &["tests", "tests.rs", "sim"]);
     let mut all: BTreeMap<String, Vec<usize>> = BTreeMap::new();
     for file in files {

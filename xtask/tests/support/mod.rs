@@ -1,4 +1,4 @@
-//! What the tests of this crate share: the workspace, commands, and the environment of AXON's programs.
+//! Code that the tests of this crate share: the workspace, commands, and the environment of AXON's programs.
 #![allow(dead_code, reason = "each test file uses its own part")]
 
 #[path = "../../../axon-transport/daemon/tests/support/excerpt.rs"]
@@ -12,7 +12,7 @@ use std::process::{Child, Command, Output};
 
 use excerpt::excerpt;
 
-/// What cargo says when it is the registry that is missing.
+/// The messages of cargo if the registry is unreachable.
 const UNREACHABLE: [&str; 6] = [
     "failed to download",
     "download of config.json failed",
@@ -57,7 +57,7 @@ pub(crate) fn profiles() -> String {
     manifest[manifest.find("\n[profile.dev]").expect("a profile")..].to_owned()
 }
 
-/// Runs a command that has to succeed. Of what it says when it does not, a part is shown.
+/// Runs a command that has to succeed. If it fails, the panic shows an excerpt of its output.
 #[track_caller]
 pub(crate) fn run(command: &mut Command) -> Output {
     let output = command.output().unwrap_or_else(|error| panic!("{command:?}: {error}"));
@@ -118,8 +118,7 @@ pub(crate) fn alone(program: &Path) -> Command {
     command
 }
 
-/// The same, with a daemon that keeps its files in a directory, does not stay long, and talks to no
-/// other host.
+/// Returns the same command with a daemon that keeps its files in a directory, ends soon, and talks to no other host.
 pub(crate) fn with_daemon(program: &Path, directory: &Path) -> Command {
     let config = directory.join("axon.toml");
     fs::write(&config, "[link]\ngrace_s = 1\n").expect("a file");
