@@ -36,7 +36,7 @@ enum class Item { Number, Bool, LongDouble, WChar, String, WString, Message };
 
 enum class Shape { One, Array, Sequence };
 
-// How a sequence stores its items.
+// The storage of a sequence's items.
 enum class Container
 {
   // The layout is unknown: each item is reached through the introspection's functions.

@@ -26,7 +26,7 @@ use kmes::Kmes;
 use search::{Needles, Sites};
 use tokio::runtime::{Builder, Runtime};
 
-/// More than a TLS record and hyper's first buffer hold.
+/// Number of keys: their answer exceeds a TLS record and hyper's first buffer.
 const MANY: u64 = 300;
 
 /// The memory below the last chunk, where the connection's task, on another thread, was late.

@@ -1,4 +1,4 @@
-//! From the settings of an attempt to a connection that awaits its election.
+//! Takes an attempt from its settings to a connection that awaits its election.
 
 use std::{
     net::SocketAddr,

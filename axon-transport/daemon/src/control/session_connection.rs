@@ -84,7 +84,7 @@ pub(super) async fn converse(
                     }
                 }
             }
-            // Too many descriptors are in flight: nothing signals the end of that.
+            // Too many descriptors are in flight. No event signals when that ends, so this waits for a time.
             () = tokio::time::sleep(Duration::from_millis(20)), if full => {}
             ready = socket.readable(), if queued < UNREAD => {
                 let Ok(mut ready) = ready else { return "its socket cannot be watched".into() };

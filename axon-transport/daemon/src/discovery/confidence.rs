@@ -1,4 +1,4 @@
-//! How strongly an address of a daemon is verified, from a proven link down to an unverified beacon.
+//! The degree to which an address of a daemon is verified, from a proven link down to an unverified beacon.
 
 /// The evidence that a daemon is at the address that a beacon gives, the strongest first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]

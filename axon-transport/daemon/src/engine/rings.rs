@@ -154,13 +154,13 @@ pub(crate) struct RingSample {
     pub(crate) call: Option<RequestId>,
     /// The bytes to send: the serialized message, or its compressed frame.
     pub(crate) payload: Bytes,
-    /// Whether the sample is compressed.
+    /// The form of the sample, which includes the state of its compression.
     form: Form,
     /// When the engine took the sample from its ring.
     pub(crate) taken: Duration,
 }
 
-/// Whether a sample is compressed.
+/// The form of a sample: the state of its compression.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Form {
     /// Compression was not requested yet.

@@ -15,9 +15,9 @@ const RETRY_AFTER_MAX: Duration = Duration::from_secs(10);
 /// Calls in flight at once.
 const IN_FLIGHT: usize = 4;
 
-/// Number of refused calls that a master may cause at once with names that the KME does not know. It exceeds the calls of
-/// a restarted receiver with the maximum number of keys. The second constant is the number of further refused calls a
-/// second.
+/// Number of refused calls that a master may cause at once with names that the KME does not know. It exceeds the calls
+/// of a restarted receiver with the maximum number of keys. The second constant is the number of further refused calls
+/// a second.
 const REFUSALS: f64 = 300.0;
 const REFUSALS_PER_SECOND: f64 = 5.0;
 

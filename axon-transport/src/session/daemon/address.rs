@@ -147,7 +147,7 @@ impl Address {
                 let own = |socket: &OwnedFd| is_own(socket);
                 match at_place(place) {
                     Err(AddressError::Busy) => Err(AddressError::Busy),
-                    // This process has no descriptors left: that does not mean that there is no daemon.
+                    // This process has no descriptors left, which does not mean that there is no daemon.
                     Err(AddressError::System(errno @ (Errno::MFILE | Errno::NFILE))) => {
                         Err(errno.into())
                     }

@@ -442,7 +442,7 @@ impl RelaySocket {
         }
         let end = end.filter(|_| !self.gone);
         fds.extend(end.map(|end| PollFd::from_borrowed_fd(end, PollFlags::IN)));
-        // Nothing signals when other connections free memory in the pool.
+        // No event signals that other connections have freed memory in the pool.
         let nap = self.incoming.is_short().then_some(NAP);
         let left = left.into_iter().chain(nap).min().and_then(|left| Timespec::try_from(left).ok());
         let _ = poll(&mut fds, left.as_ref());

@@ -167,7 +167,7 @@ struct RelayedSession {
     tally: Arc<RelayCounters>,
     /// The daemon's counts of lost samples.
     losses: Arc<Losses>,
-    /// Its publishers, clients and servers.
+    /// The publishers, clients and servers of the session.
     writers: BTreeMap<Gid, RemoteWriter>,
     subscriptions: BTreeMap<Gid, Subscription>,
     nodes: BTreeMap<Gid, Node>,

@@ -1,4 +1,4 @@
-//! From a completed TLS handshake to a connection that awaits its election: HELLO in both directions and, in
+//! Takes a connection from a completed TLS handshake to the wait for its election: HELLO in both directions and, in
 //! qkd, the proof of the client's name (`docs/formats.md`, sections 2 and 6).
 //!
 //! After each call that changes the machine, its owner drains [`poll_message`](Opening::poll_message), then

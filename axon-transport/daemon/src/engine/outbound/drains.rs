@@ -38,7 +38,7 @@ struct PublisherDrain {
 }
 
 impl PublisherDrain {
-    /// Estimates the bytes of so many samples from those of the first check.
+    /// Estimates the bytes of `samples` samples from those of the first check.
     fn bytes_of(&mut self, samples: u64, measure: impl FnOnce() -> u64) -> u64 {
         let (bytes, of) = *self.at_first.get_or_insert_with(|| (measure(), samples.max(1)));
         let left = u128::from(bytes) * u128::from(samples.min(of)) / u128::from(of);

@@ -65,13 +65,13 @@ pub(super) struct Progress {
     kept: Duration,
 }
 
-/// How much a peer takes while it holds up a publisher. The time adds up until the publisher has rested, or
-/// the peer has taken its share.
+/// The pace of a peer while it holds up a publisher: its samples and times. The times add up until the publisher has
+/// rested, or the peer has taken its share.
 #[derive(Clone, Copy, Debug, Default)]
 struct Pace {
-    /// How long the peer has held up the publisher.
+    /// The time for which the peer has held up the publisher.
     held: Duration,
-    /// How long the peer has not held up the publisher.
+    /// The time for which the peer has not held up the publisher.
     free: Duration,
     /// Samples that the peer has acknowledged since the start.
     taken: u64,
@@ -139,7 +139,7 @@ pub(super) struct StallReport {
     pub(super) quiet: Vec<FlowId>,
 }
 
-/// Whether frames of a peer arrive.
+/// The state of a link, by the arrival of the peer's frames.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum LinkActivity {
     Heard,

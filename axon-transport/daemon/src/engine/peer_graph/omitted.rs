@@ -20,8 +20,8 @@ struct FirstOmission {
 }
 
 impl OmittedEndpoints {
-    /// Records an endpoint for which there is no space, because the peer's graph `has` too much. So many `bytes` would
-    /// be enough, if bytes are what is missing.
+    /// Records an endpoint for which there is no space, because the peer's graph `has` too much. `bytes` is the number
+    /// of bytes that would be enough, if bytes are missing.
     pub(super) fn add_for_room(
         &mut self,
         endpoint: &Endpoint,

@@ -19,8 +19,8 @@ use crate::{
     wire::session::{RelayMatched, SessionMessage},
 };
 
-/// How long a client's requests wait for a server that the client already counts, until the daemon reports
-/// the match.
+/// Time for which a client's requests wait for a server that the client already counts, until the daemon reports the
+/// match.
 const SETTLING: Duration = Duration::from_secs(1);
 
 /// The stand-in for one remote writer.
