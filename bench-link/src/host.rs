@@ -2,7 +2,7 @@
 
 use std::{
     fs,
-    io::{self, BufRead, BufReader, Read, Write},
+    io::{BufRead, BufReader, Read, Write},
     os::unix::process::CommandExt as _,
     path::{Path, PathBuf},
     process::{Child, ChildStdin, ChildStdout, Command, Stdio},
@@ -19,8 +19,8 @@ use tun::Device;
 
 use crate::{Error, Result, part::Part};
 
-/// A program to start, and the channel for the answer.
-type Order = (Command, mpsc::Sender<io::Result<Child>>);
+/// What a host's thread does in the host's namespace.
+type Order = Box<dyn FnOnce() + Send>;
 
 /// Gives this process the right to make network namespaces, if it does not have it. To be called before
 /// there is a second thread.
@@ -38,39 +38,57 @@ pub(crate) fn prepare() -> Result<()> {
 
 /// A host. It lasts as long as this process.
 pub(crate) struct Host {
-    pub(crate) device: Arc<Device>,
+    /// One for each path.
+    pub(crate) devices: Vec<Arc<Device>>,
     orders: mpsc::Sender<Order>,
     directory: PathBuf,
-    address: String,
-    peer: String,
+    number: u8,
+    settings: Vec<(&'static str, String)>,
 }
 
 impl Host {
-    /// Starts a host with this address in 10.77.0.0/24. Its programs have a directory of their own in `directory`.
-    pub(crate) fn start(directory: &Path, number: u8, congestion: &str) -> Result<Self> {
-        let (address, peer) = (format!("10.77.0.{number}"), format!("10.77.0.{}", 3 - number));
+    /// A host with an address in the network of each path. Its programs find it in a directory of its own in `directory`;
+    /// `link` is the `[link]` section of their file.
+    pub(crate) fn start(directory: &Path, number: u8, paths: u8, link: &str) -> Result<Self> {
         let directory = directory.join(format!("host-{number}"));
         fs::create_dir_all(&directory)?;
-        let config = format!("[link]\ngrace_s = 1\ncongestion = {congestion:?}\n");
-        fs::write(directory.join("axon.toml"), config)?;
+        fs::write(directory.join("axon.toml"), format!("[link]\n{link}"))?;
         let (orders, received) = mpsc::channel::<Order>();
-        let (made, device) = mpsc::channel();
-        let own = address.clone();
+        let (made, devices) = mpsc::channel();
         // The namespace is this thread's, and that of the programs which it starts.
         thread::spawn(move || {
-            let device = make_device(&own);
-            let failed = device.is_err();
-            let _ = made.send(device);
-            while !failed && let Ok((mut command, answer)) = received.recv() {
-                let _ = answer.send(command.spawn());
+            let devices = make_devices(number, paths);
+            let failed = devices.is_err();
+            let _ = made.send(devices);
+            while !failed && let Ok(order) = received.recv() {
+                order();
             }
         });
-        let device = Arc::new(device.recv()??);
-        Ok(Self { device, orders, directory, address, peer })
+        let devices = devices.recv()??;
+        let peers = (0..paths).map(|path| address(path, 3 - number)).collect::<Vec<_>>().join(";");
+        let settings = vec![("AXON_DAEMON_PEERS", peers)];
+        Ok(Self { devices, orders, directory, number, settings })
     }
 
-    pub(crate) fn address(&self) -> &str {
-        &self.address
+    /// Gives a variable this value for the programs that are started from now on.
+    pub(crate) fn set(&mut self, settings: impl IntoIterator<Item = (&'static str, String)>) {
+        self.settings.extend(settings);
+    }
+
+    /// Its address on the first path.
+    pub(crate) fn address(&self) -> String {
+        address(0, self.number)
+    }
+
+    /// Does something in the host's namespace.
+    pub(crate) fn within<T: Send + 'static>(
+        &self,
+        order: impl FnOnce() -> T + Send + 'static,
+    ) -> Result<T> {
+        let (answer, answered) = mpsc::channel();
+        let order = move || drop(answer.send(order()));
+        self.orders.send(Box::new(order)).map_err(|_| "the thread of a host has ended")?;
+        Ok(answered.recv()?)
     }
 
     /// Starts a part of a measurement.
@@ -78,22 +96,25 @@ impl Host {
         let mut command = Command::new(std::env::current_exe()?);
         command.arg("part").arg(serde_json::to_string(part)?);
         let ours = |name: &str| name.starts_with("AXON_") || name.starts_with("ROS_");
-        for (name, _) in std::env::vars().filter(|(name, _)| ours(name)) {
+        for (name, _) in std::env::vars().filter(|(name, _)| ours(name) && name != "AXON_LOG") {
             command.env_remove(name);
         }
         command.env("AXON_CONFIG", self.directory.join("axon.toml"));
         command.env("AXON_RUNTIME_DIR", self.directory.join("run"));
-        command.env("AXON_DAEMON_PEERS", &self.peer);
+        command.envs(self.settings.iter().map(|(name, value)| (name, value)));
         command.stdin(Stdio::piped()).stdout(Stdio::piped());
         // The program's standard input ends with this process, and the program ends with its standard input.
         command.process_group(0);
-        let (answer, child) = mpsc::channel();
-        self.orders.send((command, answer)).map_err(|_| "the thread of a host has ended")?;
-        Running::new(child.recv()??)
+        Running::new(self.within(move || command.spawn())??)
     }
 }
 
-fn make_device(address: &str) -> Result<Device> {
+/// The address of a host in the network of a path.
+fn address(path: u8, host: u8) -> String {
+    format!("10.{}.0.{host}", 77 + path)
+}
+
+fn make_devices(number: u8, paths: u8) -> Result<Vec<Arc<Device>>> {
     unshare(CloneFlags::CLONE_NEWNET)
         .map_err(|error| format!("a network namespace cannot be made: {error}"))?;
     // The loopback must be up, because a daemon also sends to its own address.
@@ -101,8 +122,13 @@ fn make_device(address: &str) -> Result<Device> {
     if !up.is_ok_and(|status| status.success()) {
         return Err("`ip link set lo up` fails: is iproute2 installed?".into());
     }
+    (0..paths).map(|path| make_device(path, number).map(Arc::new)).collect()
+}
+
+fn make_device(path: u8, number: u8) -> Result<Device> {
     let mut configuration = tun::Configuration::default();
-    configuration.tun_name("path0").address(address).netmask("255.255.255.0").mtu(1500).up();
+    configuration.tun_name(format!("path{path}")).address(address(path, number));
+    configuration.netmask("255.255.255.0").mtu(1500).up();
     tun::create(&configuration)
         .map_err(|error| format!("the device of a host cannot be made: {error}").into())
 }

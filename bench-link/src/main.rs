@@ -4,6 +4,8 @@
 #![allow(clippy::print_stdout, reason = "what it prints is its result")]
 
 mod host;
+mod kmes;
+mod mode;
 mod part;
 mod path;
 mod place;
@@ -19,8 +21,10 @@ use clap::{Parser, Subcommand, ValueEnum};
 use serde_json::{Map, Value, json};
 
 use self::{
+    mode::Mode,
     part::Part,
     path::{Loss, Settings},
+    place::Plan,
     scenarios::Options,
 };
 
@@ -61,6 +65,9 @@ struct Arguments {
     /// How long each stream flows, in seconds.
     #[arg(long, default_value_t = 20.0)]
     seconds: f64,
+    /// Security modes of both daemons: everything is measured in each. TCP is measured in the first one only.
+    #[arg(long, value_enum, value_delimiter = ',', default_values_t = [Mode::Classic])]
+    mode: Vec<Mode>,
     /// `[link] congestion` of both daemons.
     #[arg(long, default_value = "auto", value_parser = ["auto", "delay", "cubic", "bbr"])]
     congestion: String,
@@ -125,16 +132,15 @@ fn run(arguments: &Arguments) -> Result<()> {
     if let Some(Command::Part { part }) = &arguments.command {
         return serde_json::from_str::<Part>(part)?.run();
     }
-    let options = options(arguments)?;
+    let path = path(arguments)?;
     host::prepare()?;
     println!(
-        "{} Mbit/s, round trip {} ms, queue {} bytes, bursts of {} packets; AXON in classic, congestion = {}; TCP \
-         with the kernel's {}",
+        "{} Mbit/s, round trip {} ms, queue {} bytes, bursts of {} packets; congestion = {}; TCP with the kernel's {}",
         arguments.rate,
         arguments.round_trip,
         arguments.queue,
-        options.burst,
-        options.congestion,
+        arguments.burst,
+        arguments.congestion,
         tcp::congestion()?
     );
     let chosen = match &arguments.scenarios[..] {
@@ -142,9 +148,15 @@ fn run(arguments: &Arguments) -> Result<()> {
         chosen => chosen,
     };
     let mut figures = Map::new();
-    for scenario in chosen {
-        let name = scenario.to_possible_value().ok_or("a scenario without a name")?;
-        figures.insert(name.get_name().to_owned(), scenario.run(&options)?);
+    for (index, mode) in arguments.mode.iter().enumerate() {
+        println!("\nAXON in {}", mode.name());
+        let options = options(arguments, path, *mode, index == 0);
+        let mut of_mode = Map::new();
+        for scenario in chosen {
+            let name = scenario.to_possible_value().ok_or("a scenario without a name")?;
+            of_mode.insert(name.get_name().to_owned(), scenario.run(&options)?);
+        }
+        figures.insert(mode.name().to_owned(), of_mode.into());
     }
     if let Some(file) = &arguments.json {
         let document = json!({
@@ -154,7 +166,7 @@ fn run(arguments: &Arguments) -> Result<()> {
             "queue_bytes": arguments.queue,
             "burst_packets": arguments.burst,
             "seconds": arguments.seconds,
-            "congestion": options.congestion,
+            "congestion": arguments.congestion,
             "tcp_congestion": tcp::congestion()?,
             "optimized": !cfg!(debug_assertions),
             "figures": figures,
@@ -164,7 +176,8 @@ fn run(arguments: &Arguments) -> Result<()> {
     Ok(())
 }
 
-fn options(arguments: &Arguments) -> Result<Options> {
+/// The path without losses, if the arguments make sense.
+fn path(arguments: &Arguments) -> Result<Settings> {
     let is_share = |percent: &f64| (0.0..100.0).contains(percent);
     if !arguments.losses.iter().all(is_share) {
         return Err("--losses are percentages from 0 to below 100".into());
@@ -174,19 +187,28 @@ fn options(arguments: &Arguments) -> Result<Options> {
             return Err(format!("--{name} has to be above 0").into());
         }
     }
-    let path = Settings {
+    Ok(Settings {
         rate: arguments.rate * 1e6,
         queue: arguments.queue,
         delay: Duration::try_from_secs_f64(arguments.round_trip / 2e3)?,
         loss: Loss::NONE,
         is_cut: false,
-    };
-    Ok(Options {
+    })
+}
+
+fn options(arguments: &Arguments, path: Settings, mode: Mode, with_tcp: bool) -> Options {
+    Options {
         path,
         time: Duration::from_secs_f64(arguments.seconds),
         losses: arguments.losses.iter().map(|percent| percent / 100.0).collect(),
         burst: arguments.burst,
-        congestion: arguments.congestion.clone(),
-        seed: arguments.seed,
-    })
+        plan: Plan {
+            mode,
+            congestion: arguments.congestion.clone(),
+            link: "",
+            paths: 1,
+            seed: arguments.seed,
+        },
+        with_tcp,
+    }
 }

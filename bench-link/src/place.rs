@@ -7,6 +7,8 @@ use tempfile::TempDir;
 use crate::{
     Result,
     host::{Host, Running},
+    kmes::Kmes,
+    mode::Mode,
     part::{Part, Sent, Stream, Taken},
     path::Settings,
     relay::Relay,
@@ -42,21 +44,53 @@ pub(crate) struct Outcome {
     pub(crate) taken: Taken,
 }
 
+/// How two hosts are set up.
+#[derive(Clone, Debug)]
+pub(crate) struct Plan {
+    pub(crate) mode: Mode,
+    /// `[link] congestion` of both daemons.
+    pub(crate) congestion: String,
+    /// Further lines of `[link]`.
+    pub(crate) link: &'static str,
+    /// How many paths lead from one to the other.
+    pub(crate) paths: u8,
+    pub(crate) seed: u64,
+}
+
 /// Two hosts.
 pub(crate) struct Place {
     hosts: [Host; 2],
-    pub(crate) relay: Relay,
-    /// The directory for the hosts' files, such as the logs of their daemons.
+    /// One for each path.
+    relays: Vec<Relay>,
+    _kmes: Option<Kmes>,
+    /// Where the hosts keep their files, such as the logs of their daemons.
     _directory: TempDir,
 }
 
 impl Place {
-    pub(crate) fn new(settings: Settings, congestion: &str, seed: u64) -> Result<Self> {
+    pub(crate) fn new(settings: Settings, plan: &Plan) -> Result<Self> {
         let directory = tempfile::Builder::new().prefix("axon-link-").tempdir()?;
-        let host = |number| Host::start(directory.path(), number, congestion);
-        let hosts = [host(1)?, host(2)?];
-        let devices = hosts.each_ref().map(|host| Arc::clone(&host.device));
-        Ok(Self { relay: Relay::start(devices, settings, seed), hosts, _directory: directory })
+        let link = format!("grace_s = 1\ncongestion = {:?}\n{}", plan.congestion, plan.link);
+        let host = |number| Host::start(directory.path(), number, plan.paths, &link);
+        let mut hosts = [host(1)?, host(2)?];
+        let kmes = plan.mode.is_qkd().then(Kmes::start).transpose()?;
+        for (number, host) in hosts.iter_mut().enumerate() {
+            host.set(plan.mode.settings());
+            if let Some(kmes) = &kmes {
+                kmes.connect(number, host)?;
+                host.set(kmes.settings(number));
+            }
+        }
+        let relays = (0..usize::from(plan.paths)).zip(plan.seed..).map(|(path, seed)| {
+            let devices = hosts.each_ref().map(|host| Arc::clone(&host.devices[path]));
+            Relay::start(devices, settings, seed)
+        });
+        Ok(Self { relays: relays.collect(), hosts, _kmes: kmes, _directory: directory })
+    }
+
+    /// The relay of the first path.
+    pub(crate) fn relay(&self) -> &Relay {
+        &self.relays[0]
     }
 
     /// Starts streams from the first host to the second. They are ready when this returns.

@@ -35,10 +35,12 @@ fn figures(arguments: &[&str]) -> Option<Value> {
 /// A RELIABLE sample crosses a path that loses a fifth of all packets. How soon is not asserted.
 #[test]
 fn reliable_samples_arrive_over_a_lossy_path() {
-    let Some(all) = figures(&["losses", "--losses", "20", "--seconds", "1"]) else { return };
-    let rows = all["figures"]["losses"].as_array().unwrap();
-    assert_eq!(rows.len(), 7);
-    for row in rows {
+    let arguments = ["losses", "--losses", "20", "--seconds", "1", "--mode", "classic,messages10"];
+    let Some(all) = figures(&arguments) else { return };
+    let [classic, messages10] =
+        ["classic", "messages10"].map(|mode| all["figures"][mode]["losses"].as_array().unwrap());
+    assert_eq!((classic.len(), messages10.len()), (7, 4), "TCP is measured once");
+    for row in classic.iter().chain(messages10) {
         assert!(row["published"].as_u64().unwrap() > 10, "{row}");
         assert!(row["packets_lost"].as_u64().unwrap() > 0, "{row}");
         let arrived = row["arrived_percent"].as_f64().unwrap();

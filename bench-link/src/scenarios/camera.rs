@@ -5,12 +5,7 @@ use std::time::Duration;
 use serde_json::{Value, json};
 
 use super::{Options, ms, quantile};
-use crate::{
-    Result,
-    part::Stream,
-    place::{Carrier, Place},
-    table::Table,
-};
+use crate::{Result, part::Stream, place::Place, table::Table};
 
 /// Measures a camera of 25 MB/s beside a command at 100 Hz.
 pub(crate) fn camera(options: &Options) -> Result<Value> {
@@ -30,8 +25,8 @@ pub(crate) fn camera(options: &Options) -> Result<Value> {
         stream("/cmd_vel", 100, Duration::from_millis(10), 10),
     ];
     let mut figures = Vec::new();
-    let place = Place::new(options.path, &options.congestion, options.seed)?;
-    for carrier in Carrier::ALL {
+    let place = Place::new(options.path, &options.plan)?;
+    for carrier in options.carriers().iter().copied() {
         let outcomes = place.measure(carrier, &streams, options.time)?;
         for (stream, outcome) in streams.iter().zip(&outcomes) {
             let ages = outcome.ages();

@@ -8,7 +8,7 @@ use super::{MS, Options};
 use crate::{
     Result,
     part::{Stream, now_ns},
-    place::{Carrier, Place},
+    place::Place,
     table::Table,
 };
 
@@ -28,8 +28,8 @@ pub(crate) fn cut(options: &Options) -> Result<Value> {
     let table = Table::new(&header);
     let mut figures = Vec::new();
     for seconds in [5, 20, 60] {
-        for carrier in Carrier::ALL {
-            let place = Place::new(options.path, &options.congestion, options.seed)?;
+        for carrier in options.carriers().iter().copied() {
+            let place = Place::new(options.path, &options.plan)?;
             let stream = Stream {
                 topic: "/odometry".to_owned(),
                 bytes: 1_000,
@@ -40,10 +40,10 @@ pub(crate) fn cut(options: &Options) -> Result<Value> {
             let mut streams = place.streams(carrier, &[stream])?;
             streams.begin()?;
             thread::sleep(Duration::from_secs(3));
-            place.relay.set(|settings| settings.is_cut = true);
+            place.relay().set(|settings| settings.is_cut = true);
             thread::sleep(Duration::from_secs(seconds));
             let returned = now_ns();
-            place.relay.set(|settings| settings.is_cut = false);
+            place.relay().set(|settings| settings.is_cut = false);
             thread::sleep(options.time);
             let outcome = &streams.end()?[0];
             let arrivals = &outcome.taken.arrivals;

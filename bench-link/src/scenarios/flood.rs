@@ -5,13 +5,7 @@ use std::time::Duration;
 use serde_json::{Value, json};
 
 use super::Options;
-use crate::{
-    Result,
-    part::Stream,
-    path::Loss,
-    place::{Carrier, Place},
-    table::Table,
-};
+use crate::{Result, part::Stream, path::Loss, place::Place, table::Table};
 
 const BYTES: usize = 16 << 10;
 
@@ -29,7 +23,7 @@ pub(crate) fn flood(options: &Options) -> Result<Value> {
         let mut path = options.path;
         path.delay = delay;
         path.loss = Loss { share, burst: options.burst };
-        let place = Place::new(path, &options.congestion, options.seed)?;
+        let place = Place::new(path, &options.plan)?;
         let stream = Stream {
             topic: "/flood".to_owned(),
             bytes: BYTES,
@@ -37,7 +31,7 @@ pub(crate) fn flood(options: &Options) -> Result<Value> {
             is_reliable: true,
             depth: None,
         };
-        for carrier in Carrier::ALL {
+        for carrier in options.carriers().iter().copied() {
             let outcome = &place.measure(carrier, std::slice::from_ref(&stream), options.time)?[0];
             // The first second is the start.
             let begin =

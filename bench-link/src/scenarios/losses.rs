@@ -72,7 +72,7 @@ pub(crate) fn losses(options: &Options) -> Result<Value> {
     for share in &options.losses {
         let mut path = options.path;
         path.loss = Loss { share: *share, burst: options.burst };
-        let place = Place::new(path, &options.congestion, options.seed)?;
+        let place = Place::new(path, &options.plan)?;
         for row in &ROWS {
             let stream = Stream {
                 topic: "/stream".to_owned(),
@@ -81,15 +81,15 @@ pub(crate) fn losses(options: &Options) -> Result<Value> {
                 is_reliable: row.is_reliable,
                 depth: Some(row.depth),
             };
-            for carrier in Carrier::ALL {
+            for carrier in options.carriers().iter().copied() {
                 // TCP has no best effort.
                 if carrier == Carrier::Tcp && !row.is_reliable {
                     continue;
                 }
-                let before = place.relay.counters();
+                let before = place.relay().counters();
                 let outcome =
                     &place.measure(carrier, std::slice::from_ref(&stream), options.time)?[0];
-                let packets = place.relay.counters().since(&before);
+                let packets = place.relay().counters().since(&before);
                 let ages = outcome.ages();
                 let within = |ms| outcome.within(Duration::from_millis(ms));
                 let cell = |time| {

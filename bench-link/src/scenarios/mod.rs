@@ -14,7 +14,10 @@ pub(crate) use flood::flood;
 pub(crate) use losses::losses;
 pub(crate) use slow::slow;
 
-use crate::{path::Settings, place::Outcome};
+use crate::{
+    path::Settings,
+    place::{Carrier, Outcome, Plan},
+};
 
 /// The options of all scenarios.
 #[derive(Clone, Debug)]
@@ -27,9 +30,17 @@ pub(crate) struct Options {
     pub(crate) losses: Vec<f64>,
     /// Packets that are lost in a row, on average.
     pub(crate) burst: f64,
-    /// `[link] congestion` of both daemons.
-    pub(crate) congestion: String,
-    pub(crate) seed: u64,
+    /// The hosts.
+    pub(crate) plan: Plan,
+    /// Whether TCP is measured, too.
+    pub(crate) with_tcp: bool,
+}
+
+impl Options {
+    /// What is measured.
+    fn carriers(&self) -> &'static [Carrier] {
+        if self.with_tcp { &Carrier::ALL } else { &Carrier::ALL[..1] }
+    }
 }
 
 const MS: u64 = 1_000_000;

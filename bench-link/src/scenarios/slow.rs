@@ -8,7 +8,7 @@ use super::{MS, Options, ms, quantile};
 use crate::{
     Result,
     part::{Arrival, Stream, now_ns},
-    place::{Carrier, Place},
+    place::Place,
     table::Table,
 };
 
@@ -24,8 +24,8 @@ pub(crate) fn slow(options: &Options) -> Result<Value> {
     );
     let table = Table::new(&["rate", "carrier", ">arrive", ">median age", ">longest"]);
     let mut figures = Vec::new();
-    let place = Place::new(options.path, &options.congestion, options.seed)?;
-    for carrier in Carrier::ALL {
+    let place = Place::new(options.path, &options.plan)?;
+    for carrier in options.carriers().iter().copied() {
         let stream = Stream {
             topic: "/map".to_owned(),
             bytes: 64_000,
@@ -37,10 +37,10 @@ pub(crate) fn slow(options: &Options) -> Result<Value> {
         streams.begin()?;
         thread::sleep(Duration::from_secs(3));
         let fell = now_ns();
-        place.relay.set(|settings| settings.rate = SLOW);
+        place.relay().set(|settings| settings.rate = SLOW);
         thread::sleep(options.time);
         let returned = now_ns();
-        place.relay.set(|settings| settings.rate = options.path.rate);
+        place.relay().set(|settings| settings.rate = options.path.rate);
         thread::sleep(Duration::from_secs(6));
         let end = now_ns();
         let outcome = &streams.end()?[0];
