@@ -1,6 +1,7 @@
 //! A host: a network namespace with one device, in which programs are started.
 
 use std::{
+    ffi::OsString,
     fs,
     io::{BufRead, BufReader, Read, Write},
     os::unix::process::CommandExt as _,
@@ -10,11 +11,17 @@ use std::{
     thread,
 };
 
+use axon_transport::{
+    config::{Config, OsFiles},
+    daemon_status,
+};
 use nix::{
     sched::{CloneFlags, unshare},
     unistd::{getgid, getuid},
 };
+use rustix::process::{Pid, Signal, kill_process};
 use serde::{Serialize, de::DeserializeOwned};
+use serde_json::Value;
 use tun::Device;
 
 use crate::{Error, Result, part::Part};
@@ -91,6 +98,25 @@ impl Host {
         Ok(answered.recv()?)
     }
 
+    /// The process of its daemon, if it has one.
+    pub(crate) fn daemon(&self) -> Option<Pid> {
+        let variables = self.variables().into_iter();
+        let variables = variables.map(|(name, value)| (OsString::from(name), value));
+        let config = Config::resolve(variables, None, &OsFiles).ok()?;
+        let status: Value = serde_json::from_str(&daemon_status(&config).ok()?).ok()?;
+        Pid::from_raw(status["pid"].as_i64()?.try_into().ok()?)
+    }
+
+    /// What its programs have in their environment.
+    fn variables(&self) -> Vec<(&'static str, OsString)> {
+        let mut variables = vec![
+            ("AXON_CONFIG", self.directory.join("axon.toml").into()),
+            ("AXON_RUNTIME_DIR", self.directory.join("run").into()),
+        ];
+        variables.extend(self.settings.iter().map(|(name, value)| (*name, value.into())));
+        variables
+    }
+
     /// Starts a part of a measurement.
     pub(crate) fn start_part(&self, part: &Part) -> Result<Running> {
         let mut command = Command::new(std::env::current_exe()?);
@@ -99,9 +125,7 @@ impl Host {
         for (name, _) in std::env::vars().filter(|(name, _)| ours(name) && name != "AXON_LOG") {
             command.env_remove(name);
         }
-        command.env("AXON_CONFIG", self.directory.join("axon.toml"));
-        command.env("AXON_RUNTIME_DIR", self.directory.join("run"));
-        command.envs(self.settings.iter().map(|(name, value)| (name, value)));
+        command.envs(self.variables());
         command.stdin(Stdio::piped()).stdout(Stdio::piped());
         // The program's standard input ends with this process, and the program ends with its standard input.
         command.process_group(0);
@@ -112,6 +136,11 @@ impl Host {
 /// The address of a host in the network of a path.
 fn address(path: u8, host: u8) -> String {
     format!("10.{}.0.{host}", 77 + path)
+}
+
+/// Kills a process. Returns whether it was there.
+pub(crate) fn kill(pid: Pid) -> bool {
+    kill_process(pid, Signal::KILL).is_ok()
 }
 
 fn make_devices(number: u8, paths: u8) -> Result<Vec<Arc<Device>>> {
@@ -133,24 +162,27 @@ fn make_device(path: u8, number: u8) -> Result<Device> {
         .map_err(|error| format!("the device of a host cannot be made: {error}").into())
 }
 
+const NO_OUTPUT: &str = "no standard output";
+
 /// A program on a host. It ends when this is dropped.
 pub(crate) struct Running {
     child: Child,
     input: Option<ChildStdin>,
-    output: BufReader<ChildStdout>,
+    output: Option<BufReader<ChildStdout>>,
 }
 
 impl Running {
     fn new(mut child: Child) -> Result<Self> {
         let input = child.stdin.take();
-        let output = BufReader::new(child.stdout.take().ok_or("no standard output")?);
+        let output = child.stdout.take().map(BufReader::new);
         Ok(Self { child, input, output })
     }
 
     /// Waits for a line and returns its value.
     pub(crate) fn hear<T: DeserializeOwned>(&mut self) -> Result<T> {
         let mut line = String::new();
-        if self.output.read_line(&mut line)? == 0 {
+        let output = self.output.as_mut().ok_or(NO_OUTPUT)?;
+        if output.read_line(&mut line)? == 0 {
             return Err("a part of the measurement has ended".into());
         }
         Ok(serde_json::from_str(&line)?)
@@ -163,7 +195,12 @@ impl Running {
         Ok(())
     }
 
-    /// Makes the program end.
+    /// Its output, which can be taken once.
+    pub(crate) fn take_output(&mut self) -> Result<BufReader<ChildStdout>> {
+        Ok(self.output.take().ok_or(NO_OUTPUT)?)
+    }
+
+    /// Has it end.
     pub(crate) fn close(&mut self) {
         self.input = None;
     }
@@ -172,7 +209,7 @@ impl Running {
     pub(crate) fn end<T: DeserializeOwned>(mut self) -> Result<T> {
         self.input = None;
         let mut text = String::new();
-        self.output.read_to_string(&mut text)?;
+        self.take_output()?.read_to_string(&mut text)?;
         serde_json::from_str(&text)
             .map_err(|error| -> Error { format!("a part of the measurement: {error}").into() })
     }

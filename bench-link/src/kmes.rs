@@ -66,4 +66,9 @@ impl Kmes {
         });
         Ok(())
     }
+
+    /// Keys that the SAEs which asked first got so far.
+    pub(crate) fn keys_drawn(&self) -> u64 {
+        self.network.kmes().iter().map(|kme| kme.counters().keys_to_masters).sum()
+    }
 }

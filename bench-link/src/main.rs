@@ -13,6 +13,7 @@ mod relay;
 mod scenarios;
 mod table;
 mod tcp;
+mod torture;
 
 use std::{error, fs, path::PathBuf, process::ExitCode, time::Duration};
 
@@ -44,7 +45,7 @@ static HEAP: ErasingHeap = ErasingHeap;
 struct Arguments {
     #[command(subcommand)]
     command: Option<Command>,
-    /// What is measured [default: all].
+    /// What is measured [default: all but torture].
     #[arg(value_enum)]
     scenarios: Vec<Scenario>,
     /// The path's rate in Mbit/s.
@@ -62,9 +63,9 @@ struct Arguments {
     /// Packets that are lost in a row, on average.
     #[arg(long, default_value_t = 1.0)]
     burst: f64,
-    /// How long each stream flows, in seconds.
-    #[arg(long, default_value_t = 20.0)]
-    seconds: f64,
+    /// How long each stream flows, in seconds; torture: how long all takes [default: 20; torture: 3600].
+    #[arg(long)]
+    seconds: Option<f64>,
     /// Security modes of both daemons: everything is measured in each. TCP is measured in the first one only.
     #[arg(long, value_enum, value_delimiter = ',', default_values_t = [Mode::Classic])]
     mode: Vec<Mode>,
@@ -98,6 +99,8 @@ enum Scenario {
     Slow,
     /// A path that is cut, and comes back.
     Cut,
+    /// Processes and daemons that are killed over a path that fails at random: every sample is accounted for.
+    Torture,
 }
 
 impl Scenario {
@@ -108,6 +111,7 @@ impl Scenario {
             Self::Camera => scenarios::camera(options),
             Self::Slow => scenarios::slow(options),
             Self::Cut => scenarios::cut(options),
+            Self::Torture => torture::torture(options),
         }
     }
 }
@@ -143,16 +147,17 @@ fn run(arguments: &Arguments) -> Result<()> {
         arguments.congestion,
         tcp::congestion()?
     );
+    let all = Scenario::value_variants().iter().copied();
     let chosen = match &arguments.scenarios[..] {
-        [] => Scenario::value_variants(),
-        chosen => chosen,
+        [] => all.filter(|scenario| *scenario != Scenario::Torture).collect(),
+        chosen => chosen.to_vec(),
     };
     let mut figures = Map::new();
     for (index, mode) in arguments.mode.iter().enumerate() {
         println!("\nAXON in {}", mode.name());
         let options = options(arguments, path, *mode, index == 0);
         let mut of_mode = Map::new();
-        for scenario in chosen {
+        for scenario in &chosen {
             let name = scenario.to_possible_value().ok_or("a scenario without a name")?;
             of_mode.insert(name.get_name().to_owned(), scenario.run(&options)?);
         }
@@ -182,7 +187,7 @@ fn path(arguments: &Arguments) -> Result<Settings> {
     if !arguments.losses.iter().all(is_share) {
         return Err("--losses are percentages from 0 to below 100".into());
     }
-    for (name, value) in [("rate", arguments.rate), ("seconds", arguments.seconds)] {
+    for (name, value) in [("rate", arguments.rate), ("seconds", arguments.seconds.unwrap_or(1.0))] {
         if !(value > 0.0 && value.is_finite()) {
             return Err(format!("--{name} has to be above 0").into());
         }
@@ -199,7 +204,7 @@ fn path(arguments: &Arguments) -> Result<Settings> {
 fn options(arguments: &Arguments, path: Settings, mode: Mode, with_tcp: bool) -> Options {
     Options {
         path,
-        time: Duration::from_secs_f64(arguments.seconds),
+        time: arguments.seconds.map(Duration::from_secs_f64),
         losses: arguments.losses.iter().map(|percent| percent / 100.0).collect(),
         burst: arguments.burst,
         plan: Plan {

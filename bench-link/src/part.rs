@@ -16,11 +16,14 @@ use rand::{Rng, SeedableRng, rngs::StdRng};
 use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
 
-use crate::{Result, tcp};
+use crate::{
+    Result, tcp,
+    torture::{self, Role},
+};
 
 /// For daemons that start, find each other over a path that loses packets, and agree on keys.
-const PATIENCE: Duration = Duration::from_secs(60);
-/// Time between two checks of a subscriber whether it must end.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
+/// How often a subscriber looks whether it is to end.
 const LOOK: Duration = Duration::from_millis(20);
 /// Bytes of a message's number and time.
 pub(crate) const STAMP: usize = 16;
@@ -59,6 +62,8 @@ pub(crate) enum Part {
     /// Sends the same messages over a TCP connection to this address.
     Send(Stream, String),
     Receive(String),
+    /// One of the processes of a torture; the number decides what it does at random.
+    Torture(Role, u64),
 }
 
 /// The result of a publisher.
@@ -88,12 +93,16 @@ pub(crate) struct Taken {
 impl Part {
     /// Runs this program until its standard input ends. The last line of its output is its result.
     pub(crate) fn run(&self) -> Result<()> {
+        if let Self::Torture(role, seed) = self {
+            return torture::run(*role, *seed);
+        }
         let orders = lines();
         match self {
             Self::Publish(stream) => publish(stream, &orders),
             Self::Subscribe(stream) => subscribe(stream, &orders),
             Self::Send(stream, address) => tcp::send(stream, address, &orders),
             Self::Receive(address) => tcp::receive(address, &orders),
+            Self::Torture(..) => Ok(()),
         }
     }
 }
@@ -157,7 +166,7 @@ pub(crate) fn paced(
     Ok(())
 }
 
-fn session() -> Result<Session> {
+pub(crate) fn session() -> Result<Session> {
     let itself = DaemonCommand::current_executable([""; 0])?;
     let options = SessionOptions::new("bench-link").daemon_command(itself);
     Ok(Session::open(&Config::from_env()?, options)?)

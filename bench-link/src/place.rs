@@ -1,6 +1,11 @@
 //! The place of a measurement: two hosts and the path between them.
 
-use std::{sync::Arc, thread, time::Duration};
+use std::{
+    path::{Path, PathBuf},
+    sync::Arc,
+    thread,
+    time::Duration,
+};
 
 use tempfile::TempDir;
 
@@ -59,12 +64,12 @@ pub(crate) struct Plan {
 
 /// Two hosts.
 pub(crate) struct Place {
-    hosts: [Host; 2],
+    pub(crate) hosts: [Host; 2],
     /// One for each path.
     relays: Vec<Relay>,
-    _kmes: Option<Kmes>,
+    kmes: Option<Kmes>,
     /// Where the hosts keep their files, such as the logs of their daemons.
-    _directory: TempDir,
+    directory: TempDir,
 }
 
 impl Place {
@@ -85,7 +90,27 @@ impl Place {
             let devices = hosts.each_ref().map(|host| Arc::clone(&host.devices[path]));
             Relay::start(devices, settings, seed)
         });
-        Ok(Self { relays: relays.collect(), hosts, _kmes: kmes, _directory: directory })
+        Ok(Self { relays: relays.collect(), hosts, kmes, directory })
+    }
+
+    /// Gives a variable this value on both hosts, for the programs that are started from now on.
+    pub(crate) fn set(&mut self, name: &'static str, value: &str) {
+        self.hosts.iter_mut().for_each(|host| host.set([(name, value.to_owned())]));
+    }
+
+    /// Keys that the KMEs gave so far, if there are KMEs.
+    pub(crate) fn keys_drawn(&self) -> Option<u64> {
+        self.kmes.as_ref().map(Kmes::keys_drawn)
+    }
+
+    /// Where the hosts keep their files.
+    pub(crate) fn directory(&self) -> &Path {
+        self.directory.path()
+    }
+
+    /// Ends it, and leaves the hosts' files where they are.
+    pub(crate) fn keep(self) -> PathBuf {
+        self.directory.keep()
     }
 
     /// The relay of the first path.

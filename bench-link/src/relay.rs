@@ -49,7 +49,12 @@ impl Relay {
         }
     }
 
-    /// Returns the counters of the packets from the first host to the second so far.
+    /// What it does to packets now.
+    pub(crate) fn settings(&self) -> Settings {
+        self.directions[0].lock().unwrap_or_else(PoisonError::into_inner).settings
+    }
+
+    /// What became of the packets from the first host to the second so far.
     pub(crate) fn counters(&self) -> Counters {
         self.directions[0].lock().unwrap_or_else(PoisonError::into_inner).counters
     }

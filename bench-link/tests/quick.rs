@@ -63,3 +63,17 @@ fn a_loss_that_is_no_share_is_refused() {
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(said.contains("from 0 to below 100"), "{}", excerpt("stderr", &said));
 }
+
+/// Processes and daemons are killed for some seconds; the program fails if a sample or a call is not accounted for.
+#[test]
+fn torture_accounts_for_every_sample() {
+    let Some(all) = figures(&["torture", "--seconds", "8", "--seed", "3"]) else { return };
+    let torture = &all["figures"]["classic"]["torture"];
+    assert!(torture["faults"].as_object().is_some_and(|faults| !faults.is_empty()), "{torture}");
+    let topics = torture["topics"].as_array().unwrap();
+    assert_eq!(topics.len(), 4);
+    for topic in topics {
+        assert!(topic["published"].as_u64().unwrap() > 0, "{topic}");
+        assert_eq!((&topic["repeated"], &topic["unaccounted"]), (&0.into(), &0.into()), "{topic}");
+    }
+}

@@ -27,7 +27,7 @@ pub(crate) fn camera(options: &Options) -> Result<Value> {
     let mut figures = Vec::new();
     let place = Place::new(options.path, &options.plan)?;
     for carrier in options.carriers().iter().copied() {
-        let outcomes = place.measure(carrier, &streams, options.time)?;
+        let outcomes = place.measure(carrier, &streams, options.time())?;
         for (stream, outcome) in streams.iter().zip(&outcomes) {
             let ages = outcome.ages();
             let [p50, p99, longest] = [50, 99, 100].map(|percent| quantile(&ages, percent));

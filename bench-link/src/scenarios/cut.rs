@@ -44,7 +44,7 @@ pub(crate) fn cut(options: &Options) -> Result<Value> {
             thread::sleep(Duration::from_secs(seconds));
             let returned = now_ns();
             place.relay().set(|settings| settings.is_cut = false);
-            thread::sleep(options.time);
+            thread::sleep(options.time());
             let outcome = &streams.end()?[0];
             let arrivals = &outcome.taken.arrivals;
             let first = arrivals.iter().find(|a| a.arrived > returned);

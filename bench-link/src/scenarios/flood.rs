@@ -32,11 +32,12 @@ pub(crate) fn flood(options: &Options) -> Result<Value> {
             depth: None,
         };
         for carrier in options.carriers().iter().copied() {
-            let outcome = &place.measure(carrier, std::slice::from_ref(&stream), options.time)?[0];
+            let outcome =
+                &place.measure(carrier, std::slice::from_ref(&stream), options.time())?[0];
             // The first second is the start.
             let begin =
                 outcome.taken.arrivals.first().map_or(0, |first| first.arrived) + 1_000_000_000;
-            let end = begin + (options.time.as_nanos() as u64).saturating_sub(1_000_000_000);
+            let end = begin + (options.time().as_nanos() as u64).saturating_sub(1_000_000_000);
             let counted =
                 outcome.taken.arrivals.iter().filter(|a| (begin..end).contains(&a.arrived));
             let bits = counted.count() as f64 * BYTES as f64 * 8.0;

@@ -88,7 +88,7 @@ pub(crate) fn losses(options: &Options) -> Result<Value> {
                 }
                 let before = place.relay().counters();
                 let outcome =
-                    &place.measure(carrier, std::slice::from_ref(&stream), options.time)?[0];
+                    &place.measure(carrier, std::slice::from_ref(&stream), options.time())?[0];
                 let packets = place.relay().counters().since(&before);
                 let ages = outcome.ages();
                 let within = |ms| outcome.within(Duration::from_millis(ms));

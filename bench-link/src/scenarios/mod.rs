@@ -24,8 +24,8 @@ use crate::{
 pub(crate) struct Options {
     /// The path, without losses.
     pub(crate) path: Settings,
-    /// The duration of each stream.
-    pub(crate) time: Duration,
+    /// How long a scenario, or each stream of one, takes; its own time if `None`.
+    pub(crate) time: Option<Duration>,
     /// The losses that are tried.
     pub(crate) losses: Vec<f64>,
     /// Packets that are lost in a row, on average.
@@ -37,12 +37,19 @@ pub(crate) struct Options {
 }
 
 impl Options {
+    /// How long each stream flows.
+    fn time(&self) -> Duration {
+        self.time.unwrap_or(TIME)
+    }
+
     /// What is measured.
     fn carriers(&self) -> &'static [Carrier] {
         if self.with_tcp { &Carrier::ALL } else { &Carrier::ALL[..1] }
     }
 }
 
+/// How long each stream flows if nothing else is said.
+const TIME: Duration = Duration::from_secs(20);
 const MS: u64 = 1_000_000;
 
 impl Outcome {

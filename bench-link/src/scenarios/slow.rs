@@ -38,7 +38,7 @@ pub(crate) fn slow(options: &Options) -> Result<Value> {
         thread::sleep(Duration::from_secs(3));
         let fell = now_ns();
         place.relay().set(|settings| settings.rate = SLOW);
-        thread::sleep(options.time);
+        thread::sleep(options.time());
         let returned = now_ns();
         place.relay().set(|settings| settings.rate = options.path.rate);
         thread::sleep(Duration::from_secs(6));
