@@ -100,11 +100,21 @@ impl Host {
 
     /// The process of its daemon, if it has one.
     pub(crate) fn daemon(&self) -> Option<Pid> {
+        Pid::from_raw(self.status()?["pid"].as_i64()?.try_into().ok()?)
+    }
+
+    /// The status of its daemon, if it has one.
+    pub(crate) fn status(&self) -> Option<Value> {
         let variables = self.variables().into_iter();
         let variables = variables.map(|(name, value)| (OsString::from(name), value));
         let config = Config::resolve(variables, None, &OsFiles).ok()?;
-        let status: Value = serde_json::from_str(&daemon_status(&config).ok()?).ok()?;
-        Pid::from_raw(status["pid"].as_i64()?.try_into().ok()?)
+        serde_json::from_str(&daemon_status(&config).ok()?).ok()
+    }
+
+    /// How many lines of its daemon's log have this text.
+    pub(crate) fn log_lines(&self, text: &str) -> usize {
+        let log = fs::read(self.directory.join("run/axon-0.log")).unwrap_or_default();
+        String::from_utf8_lossy(&log).lines().filter(|line| line.contains(text)).count()
     }
 
     /// What its programs have in their environment.

@@ -63,7 +63,7 @@ struct Arguments {
     /// Packets that are lost in a row, on average.
     #[arg(long, default_value_t = 1.0)]
     burst: f64,
-    /// How long each stream flows, in seconds; torture: how long all takes [default: 20; torture: 3600].
+    /// How long each stream flows, in seconds; paths and torture: how long all flow [default: 20; paths: 60; torture: 3600].
     #[arg(long)]
     seconds: Option<f64>,
     /// Security modes of both daemons: everything is measured in each. TCP is measured in the first one only.
@@ -99,6 +99,8 @@ enum Scenario {
     Slow,
     /// A path that is cut, and comes back.
     Cut,
+    /// Two paths, of which one after the other is cut.
+    Paths,
     /// Processes and daemons that are killed over a path that fails at random: every sample is accounted for.
     Torture,
 }
@@ -111,6 +113,7 @@ impl Scenario {
             Self::Camera => scenarios::camera(options),
             Self::Slow => scenarios::slow(options),
             Self::Cut => scenarios::cut(options),
+            Self::Paths => scenarios::paths(options),
             Self::Torture => torture::torture(options),
         }
     }

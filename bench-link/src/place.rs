@@ -66,7 +66,7 @@ pub(crate) struct Plan {
 pub(crate) struct Place {
     pub(crate) hosts: [Host; 2],
     /// One for each path.
-    relays: Vec<Relay>,
+    pub(crate) relays: Vec<Relay>,
     kmes: Option<Kmes>,
     /// Where the hosts keep their files, such as the logs of their daemons.
     directory: TempDir,
@@ -118,33 +118,43 @@ impl Place {
         &self.relays[0]
     }
 
-    /// Starts streams from the first host to the second. They are ready when this returns.
-    pub(crate) fn streams(&self, carrier: Carrier, streams: &[Stream]) -> Result<Streams> {
+    /// How many lines of the daemons' logs have this text.
+    pub(crate) fn log_lines(&self, text: &str) -> usize {
+        self.hosts.iter().map(|host| host.log_lines(text)).sum()
+    }
+
+    /// Starts AXON's streams from the first host or the second to the other one. They are ready when this returns.
+    pub(crate) fn streams_of(&self, streams: &[(usize, Stream)]) -> Result<Streams> {
         let mut running = Vec::new();
-        for (index, stream) in (0..).zip(streams) {
-            running.push(match carrier {
-                Carrier::Axon => {
-                    let there = self.hosts[1].start_part(&Part::Subscribe(stream.clone()))?;
-                    (self.hosts[0].start_part(&Part::Publish(stream.clone()))?, there)
-                }
-                Carrier::Tcp => {
-                    let address = format!("{}:{}", self.hosts[1].address(), PORT + index);
-                    let mut there = self.hosts[1].start_part(&Part::Receive(address.clone()))?;
-                    there.hear::<()>()?;
-                    (self.hosts[0].start_part(&Part::Send(stream.clone(), address))?, there)
-                }
-            });
+        for (from, stream) in streams {
+            let there = self.hosts[1 - from].start_part(&Part::Subscribe(stream.clone()))?;
+            running.push((self.hosts[*from].start_part(&Part::Publish(stream.clone()))?, there));
         }
         for (here, there) in &mut running {
             here.hear::<()>()?;
-            if carrier == Carrier::Axon {
-                there.hear::<()>()?;
-            }
+            there.hear::<()>()?;
         }
         Ok(Streams(running))
     }
 
-    /// Runs streams for `time`, and returns their results.
+    /// Starts streams from the first host to the second. They are ready when this returns.
+    pub(crate) fn streams(&self, carrier: Carrier, streams: &[Stream]) -> Result<Streams> {
+        if carrier == Carrier::Axon {
+            let from_first = streams.iter().map(|stream| (0, stream.clone()));
+            return self.streams_of(&from_first.collect::<Vec<_>>());
+        }
+        let mut running = Vec::new();
+        for (index, stream) in (0..).zip(streams) {
+            let address = format!("{}:{}", self.hosts[1].address(), PORT + index);
+            let mut there = self.hosts[1].start_part(&Part::Receive(address.clone()))?;
+            there.hear::<()>()?;
+            running.push((self.hosts[0].start_part(&Part::Send(stream.clone(), address))?, there));
+        }
+        running.iter_mut().try_for_each(|(here, _)| here.hear::<()>())?;
+        Ok(Streams(running))
+    }
+
+    /// What became of streams that flow for this long.
     pub(crate) fn measure(
         &self,
         carrier: Carrier,

@@ -49,17 +49,15 @@ pub(crate) fn cut(options: &Options) -> Result<Value> {
             let arrivals = &outcome.taken.arrivals;
             let first = arrivals.iter().find(|a| a.arrived > returned);
             let flows_ms = first.map(|a| (a.arrived - returned) / MS);
-            let mut numbers: Vec<u64> = arrivals.iter().map(|a| a.number).collect();
-            numbers.sort_unstable();
-            numbers.dedup();
-            let twice = arrivals.len() - numbers.len();
+            let numbers = outcome.numbers();
+            let twice = arrivals.len() - numbers;
             table.row([
                 format!("{seconds} s"),
                 carrier.name().to_owned(),
                 flows_ms.map_or_else(|| "never".to_owned(), |ms| format!("{ms} ms")),
                 outcome.sent.messages.to_string(),
                 outcome.sent.refused.to_string(),
-                numbers.len().to_string(),
+                numbers.to_string(),
                 outcome.taken.lost.to_string(),
                 twice.to_string(),
             ])?;
@@ -69,7 +67,7 @@ pub(crate) fn cut(options: &Options) -> Result<Value> {
                 "flows_after_ms": flows_ms,
                 "sent": outcome.sent.messages,
                 "refused": outcome.sent.refused,
-                "arrived": numbers.len(),
+                "arrived": numbers,
                 "lost": outcome.taken.lost,
                 "twice": twice,
             }));

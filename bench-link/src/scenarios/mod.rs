@@ -4,6 +4,7 @@ mod camera;
 mod cut;
 mod flood;
 mod losses;
+mod paths;
 mod slow;
 
 use std::time::Duration;
@@ -12,6 +13,7 @@ pub(crate) use camera::camera;
 pub(crate) use cut::cut;
 pub(crate) use flood::flood;
 pub(crate) use losses::losses;
+pub(crate) use paths::paths;
 pub(crate) use slow::slow;
 
 use crate::{
@@ -68,7 +70,20 @@ impl Outcome {
         100.0 * count as f64 / self.sent.messages.max(1) as f64
     }
 
-    /// Returns the share that arrived at all, in percent.
+    /// How many samples were published.
+    fn published(&self) -> u64 {
+        self.sent.messages - self.sent.refused
+    }
+
+    /// How many messages arrived, each counted once.
+    fn numbers(&self) -> usize {
+        let mut numbers: Vec<u64> = self.taken.arrivals.iter().map(|a| a.number).collect();
+        numbers.sort_unstable();
+        numbers.dedup();
+        numbers.len()
+    }
+
+    /// The share that arrived at all, in percent.
     fn arrived(&self) -> f64 {
         self.within(Duration::MAX)
     }
