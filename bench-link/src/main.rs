@@ -9,6 +9,7 @@ mod mode;
 mod part;
 mod path;
 mod place;
+mod plot;
 mod relay;
 mod scenarios;
 mod table;
@@ -78,6 +79,9 @@ struct Arguments {
     /// Writes the figures to this file.
     #[arg(long)]
     json: Option<PathBuf>,
+    /// Draws what arrives at which loss to this file, as SVG; needs `losses`.
+    #[arg(long)]
+    plot: Option<PathBuf>,
 }
 
 #[derive(Subcommand)]
@@ -155,6 +159,11 @@ fn run(arguments: &Arguments) -> Result<()> {
         [] => all.filter(|scenario| *scenario != Scenario::Torture).collect(),
         chosen => chosen.to_vec(),
     };
+    if arguments.plot.is_some() && !chosen.contains(&Scenario::Losses) {
+        return Err(
+            "--plot draws the scenario losses, which is not among those that are measured".into()
+        );
+    }
     let mut figures = Map::new();
     for (index, mode) in arguments.mode.iter().enumerate() {
         println!("\nAXON in {}", mode.name());
@@ -165,6 +174,9 @@ fn run(arguments: &Arguments) -> Result<()> {
             of_mode.insert(name.get_name().to_owned(), scenario.run(&options)?);
         }
         figures.insert(mode.name().to_owned(), of_mode.into());
+    }
+    if let Some(file) = &arguments.plot {
+        plot::losses(file, &figures)?;
     }
     if let Some(file) = &arguments.json {
         let document = json!({
