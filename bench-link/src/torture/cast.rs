@@ -134,7 +134,7 @@ impl<'a> Cast<'a> {
         all
     }
 
-    /// One of those that fit.
+    /// Chooses one of the processes that fit.
     pub(super) fn choose(&self, pick: u64, fits: impl Fn(&Role) -> bool) -> Option<usize> {
         let all = self.find(fits);
         let at = pick.checked_rem(all.len() as u64)?;
@@ -173,7 +173,7 @@ impl<'a> Cast<'a> {
         Ok(())
     }
 
-    /// Whether nobody is to end any more.
+    /// Whether all processes that were told to end have ended.
     pub(super) fn is_settled(&self) -> bool {
         self.leaving.is_empty()
     }

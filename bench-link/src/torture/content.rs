@@ -21,7 +21,7 @@ pub(super) fn fill(bytes: &mut [u8], key: u64, number: u64, sent: u64) {
     rest.copy_from_slice(&last[..rest.len()]);
 }
 
-/// Returns the time of a message, or what is wrong with it.
+/// Returns the time of a message, or the reason why it is not whole.
 pub(super) fn check(bytes: &[u8], key: u64, number: u64) -> Result<u64, String> {
     let Some((header, body)) = bytes.split_at_checked(HEADER) else {
         return Err(format!("{} bytes", bytes.len()));

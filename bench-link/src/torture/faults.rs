@@ -77,7 +77,7 @@ impl Faults {
         }
     }
 
-    /// Does what is due.
+    /// Applies the faults whose time has come.
     pub(super) fn handle_time(&mut self, place: &Place, cast: &mut Cast<'_>) -> Result<()> {
         let now = Instant::now();
         if self.cut_until.take_if(|until| *until <= now).is_some() {

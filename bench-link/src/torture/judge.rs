@@ -85,7 +85,7 @@ impl<'a> Judge<'a> {
             row.unaccounted += self.check_count(subscriber);
             for (gid, intake) in &subscriber.taken {
                 let Some(publisher) = of(publishers).find(|entry| entry.gid == *gid) else {
-                    self.tell(subscriber, format!("got samples of {gid}, which nobody is"));
+                    self.tell(subscriber, format!("got samples of {gid}, which is no publisher"));
                     continue;
                 };
                 // Of the last sample of a killed publisher nothing may have been heard.
@@ -131,7 +131,7 @@ impl<'a> Judge<'a> {
             let missing = (first..=last).filter(|number| !intake.has(*number));
             let missing: Vec<u64> = missing.collect();
             if !missing.is_empty() {
-                let what = "of those after all faults";
+                let what = "that were published after all faults";
                 return self.tell_missing(publisher, subscriber, &missing, what);
             }
         }
@@ -249,8 +249,8 @@ impl<'a> Judge<'a> {
     }
 }
 
-/// The samples that were published for a subscriber and did not come. What a dead subscriber had not got by then nobody
-/// knows.
+/// Returns the samples that were published for a subscriber and did not come. Of a dead subscriber only samples before
+/// its last one count.
 fn missing(publisher: &Entry, subscriber: &Entry, intake: &Intake) -> Vec<u64> {
     let until = if subscriber.lives() { u64::MAX } else { intake.last };
     let ranges = publisher.published_for(&subscriber.gid).into_iter();

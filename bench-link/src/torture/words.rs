@@ -153,7 +153,7 @@ pub(super) enum Report {
         number: u64,
         at: u64,
     },
-    /// What must not be.
+    /// The process saw a broken rule itself.
     Broken {
         what: String,
     },
