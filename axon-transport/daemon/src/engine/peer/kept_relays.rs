@@ -7,7 +7,7 @@ use std::{
     time::Duration,
 };
 
-use super::routes::served::ServedRoutes;
+use super::routes::served::{ServedRoute, ServedRoutes};
 use crate::engine::route::{RelaySpec, RouteKey};
 use crate::engine::{
     account::{Charge, Meter},
@@ -80,31 +80,43 @@ impl KeptRelays {
         outbound: &mut Outbound,
         now: Duration,
     ) {
-        let room = self.room_of(identity);
         for (number, served) in served.iter_mut() {
-            let lanes = served.lanes.amount() / served.sources.len().max(1);
-            let (sources, unfinished) = outbound.take_kept(number, room.left(), now);
-            let unfinished = Rc::new(unfinished);
-            for source in sources {
-                let Source::Relay(spec, reader) = source else { continue };
-                let Some(place) = room.charge(1) else { continue };
-                let charges = [place, served.relays.split(1)];
-                let identity = identity.to_owned();
-                let (key, since, until) = (served.key.clone(), now, now + RELAY_RETENTION);
-                let unfinished = Rc::clone(&unfinished);
-                let lanes = served.lanes.split(lanes);
-                self.all.push(KeptRelay {
-                    identity,
-                    key,
-                    spec,
-                    reader,
-                    unfinished,
-                    since,
-                    until,
-                    _charges: charges,
-                    lanes,
-                });
-            }
+            self.add_route(identity, number, served, outbound, now);
+        }
+    }
+
+    /// Takes over the KEEP_ALL relays of one route, which its peer is about to ask for under another number.
+    pub(super) fn add_route(
+        &mut self,
+        identity: &str,
+        number: u32,
+        served: &mut ServedRoute,
+        outbound: &mut Outbound,
+        now: Duration,
+    ) {
+        let room = self.room_of(identity);
+        let lanes = served.lanes.amount() / served.sources.len().max(1);
+        let (sources, unfinished) = outbound.take_kept(number, room.left(), now);
+        let unfinished = Rc::new(unfinished);
+        for source in sources {
+            let Source::Relay(spec, reader) = source else { continue };
+            let Some(place) = room.charge(1) else { continue };
+            let charges = [place, served.relays.split(1)];
+            let identity = identity.to_owned();
+            let (key, since, until) = (served.key.clone(), now, now + RELAY_RETENTION);
+            let unfinished = Rc::clone(&unfinished);
+            let lanes = served.lanes.split(lanes);
+            self.all.push(KeptRelay {
+                identity,
+                key,
+                spec,
+                reader,
+                unfinished,
+                since,
+                until,
+                _charges: charges,
+                lanes,
+            });
         }
     }
 

@@ -68,11 +68,10 @@ impl Peer {
             if self.served.get(other).is_some_and(|served| served.repeated) {
                 return Err(format!("{} has a route already", key.topic));
             }
-            // The number belongs to an earlier link.
-            self.unserve(other);
+            self.unserve_earlier(other, with, now);
         }
         if self.served.get(number).is_some_and(|old| !old.repeated && old.key != key) {
-            self.unserve(number);
+            self.unserve_earlier(number, with, now);
         }
         let account = Rc::clone(self.remote.account());
         let (old, mut places, mut lanes) = match self.served.take(number) {
@@ -218,6 +217,16 @@ impl Peer {
         }
         self.served.remove(route);
         self.outbound.end_route(route);
+    }
+
+    /// Ends a route whose number belongs to an earlier link. The end of that link was seen by the peer alone, which asks
+    /// for its routes under other numbers now. What it did not acknowledge waits for that.
+    fn unserve_earlier(&mut self, route: u32, with: &PeerContext<'_>, now: Duration) {
+        if let Some(served) = self.served.get_mut(route) {
+            let mut kept = with.kept.borrow_mut();
+            kept.add_route(&self.identity, route, served, &mut self.outbound, now);
+        }
+        self.unserve(route);
     }
 
     /// Ends the routes that the peer did not ask for again over the link in use.

@@ -19,7 +19,7 @@ use crate::{
         outbound::{queue::Queue, source::FlowProgress},
         quic::connection::Carrier,
         rank::SMALL,
-        sample::frames::Frames,
+        sample::{frames::Frames, protection::Seal},
     },
     link::CloseCode,
 };
@@ -28,6 +28,9 @@ use crate::{
 pub(super) const DEFAULT_LIFESPAN: Duration = Duration::from_millis(200);
 /// Maximum time that QUIC may take to deliver a sample, which is then given up.
 const DELIVERY_TIMEOUT: Duration = Duration::from_secs(10);
+/// The same for a sample with an envelope. The peer erases the key 5 s after it learned that the key is retired, and a
+/// message that comes later ends the link.
+const SEALED_DELIVERY_TIMEOUT: Duration = Duration::from_secs(4);
 /// Number of samples that may be in flight whatever the congestion window.
 const ALWAYS: usize = 2;
 
@@ -151,7 +154,11 @@ impl BestEffort {
             let priority = rank.of_stream() - i32::from(!self.under_way.is_empty());
             let _ = carrier.quic.send_stream(stream).set_priority(priority);
             carrier.streams.insert(stream, carrier.flow);
-            let left = sample.lifespan_left(now).unwrap_or(DELIVERY_TIMEOUT).min(DELIVERY_TIMEOUT);
+            let most = match carrier.seal {
+                Seal::Link => DELIVERY_TIMEOUT,
+                Seal::Envelope { .. } => SEALED_DELIVERY_TIMEOUT,
+            };
+            let left = sample.lifespan_left(now).unwrap_or(most).min(most);
             let bytes = pending.iter().map(|piece| piece.len() as u64).sum();
             credit.set(uses);
             let (begun, deadline) = (now, now + left);
@@ -294,4 +301,18 @@ impl BestEffort {
 
 fn goodbye() -> VarInt {
     VarInt::from_u32(CloseCode::Goodbye.code())
+}
+
+#[cfg(test)]
+mod tests {
+    use axon_envelope::Limits;
+
+    use super::*;
+
+    #[test]
+    fn sealed_sample_is_given_up_before_the_peer_erases_its_key() {
+        // A round trip of a second passes between the two.
+        let erased = Limits::default().best_effort_grace;
+        assert!(SEALED_DELIVERY_TIMEOUT + Duration::from_secs(1) <= erased, "{erased:?}");
+    }
 }
