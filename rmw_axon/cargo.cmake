@@ -1,6 +1,7 @@
 # Finds cargo, refuses a Rust that is too old before anything is built, and has cargo build for what CMake builds for.
 #
-#   CARGO              the cargo to use; by default CARGO_HOME's, ~/.cargo's, that in PATH
+#   CARGO              the cargo to use; by default CARGO_HOME's, ~/.cargo's, that in PATH, or where that is too old
+#                      the newest of the packages cargo-1.NN
 #   AXON_CARGO_ARGS    more arguments of each `cargo build`: --offline
 #   AXON_CARGO_TARGET  the Rust target; by default the machine's own, or the one of CMake's toolchain file
 
@@ -9,6 +10,16 @@ set(AXON_CARGO_TARGET "" CACHE STRING
   "The Rust target of the core, as `rustc --print target-list` spells it; empty for that of CMake's compiler")
 
 set(axon_another_cargo "Another cargo is named by -DCARGO=/path/to/cargo.")
+
+# The folder of the crates: axon/ in a source package, which has all of them, and the repository otherwise.
+function(axon_core_source package result)
+  if(EXISTS ${package}/axon/Cargo.toml)
+    get_filename_component(source ${package}/axon REALPATH)
+  else()
+    get_filename_component(source ${package}/.. REALPATH)
+  endif()
+  set(${result} ${source} PARENT_SCOPE)
+endfunction()
 
 # The workspace's rust-version, the only place that says it.
 function(axon_rust_needed source result)
@@ -25,24 +36,71 @@ function(axon_rust_needed source result)
   set(${result} ${CMAKE_MATCH_1} PARENT_SCOPE)
 endfunction()
 
-# Fails where `program --version` is not that of Rust `needed` or newer. Run in `source`, where a rust-toolchain
-# file or `rustup override` may choose the toolchain.
-function(axon_require_rust program needed source)
-  get_filename_component(name ${program} NAME)
+# Sets `result` to the version of Rust that a program is of, or to nothing where it does not say. What it said
+# instead is in `said`. Run in `source`, where a rust-toolchain file or `rustup override` may choose the toolchain.
+function(axon_rust_version program source result said)
   execute_process(
     COMMAND ${program} --version WORKING_DIRECTORY ${source}
-    RESULT_VARIABLE status OUTPUT_VARIABLE said ERROR_VARIABLE errors)
-  if(NOT status EQUAL 0 OR NOT said MATCHES "([0-9]+\\.[0-9]+\\.[0-9]+)")
+    RESULT_VARIABLE status OUTPUT_VARIABLE output ERROR_VARIABLE errors)
+  set(version "")
+  if(status EQUAL 0 AND output MATCHES "([0-9]+\\.[0-9]+\\.[0-9]+)")
+    set(version ${CMAKE_MATCH_1})
+  endif()
+  set(${result} "${version}" PARENT_SCOPE)
+  set(${said} "(${status}): ${output}${errors}" PARENT_SCOPE)
+endfunction()
+
+# Fails where `program --version` is not that of Rust `needed` or newer.
+function(axon_require_rust program needed source)
+  get_filename_component(name ${program} NAME)
+  axon_rust_version(${program} ${source} version said)
+  if(NOT version)
     message(FATAL_ERROR
-      "rmw_axon needs Rust ${needed} or newer, and `${program} --version` fails (${status}): ${said}${errors}\n"
+      "rmw_axon needs Rust ${needed} or newer, and `${program} --version` fails ${said}\n"
       "Run `rustup default stable`, or install Rust from https://rustup.rs. ${axon_another_cargo}")
   endif()
-  if(CMAKE_MATCH_1 VERSION_LESS needed)
+  if(version VERSION_LESS needed)
     message(FATAL_ERROR
-      "rmw_axon needs Rust ${needed} or newer, and found ${name} ${CMAKE_MATCH_1} (${program}). "
+      "rmw_axon needs Rust ${needed} or newer, and found ${name} ${version} (${program}). "
       "Run `rustup update stable`, or install Rust from https://rustup.rs: it is preferred to an older cargo of "
-      "the distribution. ${axon_another_cargo}")
+      "the distribution. Where the distribution has them, its packages cargo-1.NN and rustc-1.NN of such a version "
+      "are found too. ${axon_another_cargo}")
   endif()
+endfunction()
+
+# Ubuntu's packages cargo-1.NN and rustc-1.NN: sets `cargo` and `rustc` to the newest pair of Rust `needed` or newer,
+# or to nothing. The folder of each version is looked at first: on some releases of Ubuntu /usr/bin/cargo-1.NN runs
+# the cargo of the default version (https://bugs.launchpad.net/bugs/2100266).
+function(axon_versioned_rust needed source cargo rustc)
+  if(NOT DEFINED AXON_RUST_PACKAGES)
+    set(AXON_RUST_PACKAGES /usr/lib)
+  endif()
+  file(GLOB cargos ${AXON_RUST_PACKAGES}/rust-1.*/bin/cargo)
+  string(REPLACE ":" ";" path "$ENV{PATH}")
+  foreach(folder IN LISTS path)
+    file(GLOB there ${folder}/cargo-1.*)
+    list(APPEND cargos ${there})
+  endforeach()
+  set(newest 0)
+  set(found_cargo "")
+  set(found_rustc "")
+  foreach(candidate IN LISTS cargos)
+    get_filename_component(folder ${candidate} DIRECTORY)
+    get_filename_component(name ${candidate} NAME)
+    string(REPLACE cargo rustc beside ${name})
+    if(EXISTS ${folder}/${beside})
+      axon_rust_version(${candidate} ${source} version said)
+      axon_rust_version(${folder}/${beside} ${source} of_rustc said)
+      if(version AND NOT version VERSION_LESS needed AND NOT of_rustc VERSION_LESS needed
+          AND version VERSION_GREATER newest)
+        set(newest ${version})
+        set(found_cargo ${candidate})
+        set(found_rustc ${folder}/${beside})
+      endif()
+    endif()
+  endforeach()
+  set(${cargo} "${found_cargo}" PARENT_SCOPE)
+  set(${rustc} "${found_rustc}" PARENT_SCOPE)
 endfunction()
 
 # Where rustup installs cargo. Without CARGO_HOME its /bin would be the distribution's.
@@ -57,30 +115,39 @@ function(axon_cargo_places result)
   set(${result} "${places}" PARENT_SCOPE)
 endfunction()
 
-# Finds cargo and the rustc that it runs; sets CARGO and AXON_RUSTC.
+# Finds cargo and the rustc that it runs; sets CARGO and AXON_RUSTC. With -DCARGO or RUSTC in the environment nothing
+# else is looked for.
 macro(axon_find_rust source)
   axon_rust_needed(${source} axon_needed)
   axon_cargo_places(axon_places)
+  set(axon_is_named FALSE)
+  if(CARGO OR NOT "$ENV{RUSTC}" STREQUAL "")
+    set(axon_is_named TRUE)
+  endif()
   find_program(CARGO cargo HINTS ${axon_places} NO_CMAKE_FIND_ROOT_PATH)
   set(axon_cargo_found ${CARGO})
   # Not kept in the cache until it fits: the next run is to find what was installed meanwhile.
   unset(CARGO CACHE)
+  set(AXON_RUSTC "")
+  if(NOT axon_is_named)
+    set(axon_version "")
+    if(axon_cargo_found)
+      axon_rust_version(${axon_cargo_found} ${source} axon_version axon_said)
+    endif()
+    if(NOT axon_version OR axon_version VERSION_LESS axon_needed)
+      axon_versioned_rust(${axon_needed} ${source} axon_cargo_versioned AXON_RUSTC)
+      if(axon_cargo_versioned)
+        set(axon_cargo_found ${axon_cargo_versioned})
+      endif()
+    endif()
+  endif()
   if(NOT axon_cargo_found)
     message(FATAL_ERROR
       "rmw_axon needs Rust ${axon_needed} or newer, and there is no cargo in CARGO_HOME, in ~/.cargo and in PATH. "
       "Install Rust from https://rustup.rs. ${axon_another_cargo}")
   endif()
   axon_require_rust(${axon_cargo_found} ${axon_needed} ${source})
-  get_filename_component(axon_cargo_bin ${axon_cargo_found} DIRECTORY)
-  set(axon_rustc_found $ENV{RUSTC})
-  if(NOT axon_rustc_found)
-    unset(axon_rustc_found)
-    find_program(axon_rustc_found rustc HINTS ${axon_cargo_bin} NO_CMAKE_FIND_ROOT_PATH)
-    set(AXON_RUSTC ${axon_rustc_found})
-    unset(axon_rustc_found CACHE)
-  else()
-    set(AXON_RUSTC ${axon_rustc_found})
-  endif()
+  axon_find_rustc(${axon_cargo_found})
   if(NOT AXON_RUSTC)
     message(FATAL_ERROR
       "rmw_axon needs Rust ${axon_needed} or newer, and found ${axon_cargo_found} but no rustc. "
@@ -88,6 +155,20 @@ macro(axon_find_rust source)
   endif()
   axon_require_rust(${AXON_RUSTC} ${axon_needed} ${source})
   set(CARGO ${axon_cargo_found} CACHE FILEPATH "The cargo that builds AXON's core")
+endmacro()
+
+# Sets AXON_RUSTC: that of the environment, that which has the version of a cargo-1.NN in its name, or that beside cargo.
+macro(axon_find_rustc cargo)
+  get_filename_component(axon_cargo_bin ${cargo} DIRECTORY)
+  get_filename_component(axon_rustc_name ${cargo} NAME)
+  string(REPLACE cargo rustc axon_rustc_name "${axon_rustc_name}")
+  if(NOT "$ENV{RUSTC}" STREQUAL "")
+    set(AXON_RUSTC $ENV{RUSTC})
+  elseif(NOT AXON_RUSTC)
+    find_program(axon_rustc_found ${axon_rustc_name} rustc HINTS ${axon_cargo_bin} NO_CMAKE_FIND_ROOT_PATH)
+    set(AXON_RUSTC ${axon_rustc_found})
+    unset(axon_rustc_found CACHE)
+  endif()
 endmacro()
 
 # The Rust target for a compiler's triple, as `gcc -dumpmachine` says it, and CMAKE_SYSTEM_PROCESSOR.
@@ -152,6 +233,16 @@ function(axon_cargo_build rustc source build command artefacts)
   # What is set for C++ packages is not for aws-lc and zstd.
   # colcon takes what cargo says of its progress, on stderr, for something to be shown.
   set(env --unset=CFLAGS --unset=CXXFLAGS CARGO_TERM_QUIET=true CARGO_TARGET_DIR=${build})
+  # Cargo runs the rustc in PATH, which is not the one that goes with a cargo of another place.
+  get_filename_component(cargo_bin ${CARGO} DIRECTORY)
+  get_filename_component(cargo_name ${CARGO} NAME)
+  if(cargo_bin MATCHES "/rust-1[.][0-9]+/bin$" OR cargo_name MATCHES "^cargo-1[.]")
+    list(APPEND env RUSTC=${rustc})
+  endif()
+  # A source package has all crates: nothing is read from the builder's home, which may not exist, or written there.
+  if(EXISTS ${source}/vendor)
+    list(APPEND env CARGO_HOME=${build}/cargo-home)
+  endif()
   set(arguments build --release --locked ${AXON_CARGO_ARGS})
   set(out ${build}/release)
   set(target "${AXON_CARGO_TARGET}")

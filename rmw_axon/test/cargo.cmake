@@ -2,7 +2,7 @@
 # cmake -DFOLDER=<temporary folder> -P test/cargo.cmake
 cmake_minimum_required(VERSION 3.16)
 include(${CMAKE_CURRENT_LIST_DIR}/../cargo.cmake)
-get_filename_component(repository ${CMAKE_CURRENT_LIST_DIR}/../.. REALPATH)
+get_filename_component(package ${CMAKE_CURRENT_LIST_DIR}/.. REALPATH)
 
 # One call, in a process of its own.
 if(DEFINED CALL)
@@ -31,7 +31,7 @@ function(expect failure expected call)
     COMMAND ${CMAKE_COMMAND} -E env --unset=RUSTC --unset=CFLAGS_aarch64_unknown_linux_gnu
       --unset=CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_RUSTFLAGS
       HOME=${FOLDER}/home CARGO_HOME=${cargo_home} "PATH=${path}"
-      ${CMAKE_COMMAND} -DCALL=${call} ${ARGN} -P ${CMAKE_CURRENT_LIST_FILE}
+      ${CMAKE_COMMAND} -DCALL=${call} -DAXON_RUST_PACKAGES=${FOLDER}/packages ${ARGN} -P ${CMAKE_CURRENT_LIST_FILE}
     RESULT_VARIABLE status OUTPUT_VARIABLE said ERROR_VARIABLE errors)
   string(REGEX REPLACE "[ \n]+" " " said "${said}${errors}")
   set(failed FALSE)
@@ -66,8 +66,9 @@ file(WRITE ${FOLDER}/source/Cargo.toml "[workspace.package]\nrust-version = \"1.
 set(source -DSOURCE=${FOLDER}/source)
 
 # The version is the workspace's, and the README says the same.
-axon_rust_needed(${repository} needed)
-file(READ ${repository}/rmw_axon/README.md readme)
+axon_core_source(${package} workspace)
+axon_rust_needed(${workspace} needed)
+file(READ ${package}/README.md readme)
 string(FIND "${readme}" "Rust ${needed} or newer" at)
 if(at EQUAL -1)
   message(SEND_ERROR "rmw_axon/README.md does not say \"Rust ${needed} or newer\"")
@@ -104,6 +105,41 @@ expect(FALSE "cargo ${FOLDER}/new/cargo, rustc ${FOLDER}/new/rustc" find ${sourc
 make_rust(${FOLDER}/home/bin 1.80.0 1.80.0)
 expect(FALSE "cargo ${FOLDER}/home/bin/cargo, rustc ${FOLDER}/home/bin/rustc" find ${source})
 
+# Packages of a version in their names, where the cargo without one is too old, does not work or is missing. The newest
+# pair counts; neither that without rustc, nor one that is too old as well.
+function(make_versioned version)
+  make_program(${FOLDER}/versioned/cargo-1.${version} "cargo 1.${version}.0 (abcdef012 2024-01-01)" 0)
+  if(NOT "WITHOUT" IN_LIST ARGN)
+    make_program(${FOLDER}/versioned/rustc-1.${version} "rustc 1.${version}.0 (abcdef012 2024-01-01)" 0)
+  endif()
+endfunction()
+file(REMOVE_RECURSE ${FOLDER}/home)
+make_versioned(69)
+set(path "${FOLDER}/old:${FOLDER}/versioned")
+expect(TRUE "found cargo 1.69.0 (${FOLDER}/old/cargo). Run `rustup update" find ${source})
+expect(TRUE "its packages cargo-1.NN and rustc-1.NN" find ${source})
+make_versioned(91)
+make_versioned(100)
+make_versioned(101 WITHOUT)
+set(versioned "cargo ${FOLDER}/versioned/cargo-1.100, rustc ${FOLDER}/versioned/rustc-1.100")
+expect(FALSE "${versioned}" find ${source})
+expect(TRUE "found cargo 1.69.0" find ${source} -DCARGO=${FOLDER}/old/cargo)
+expect(FALSE "rustc ${FOLDER}/versioned/rustc-1.91" find ${source} -DCARGO=${FOLDER}/versioned/cargo-1.91)
+foreach(other unset versioned)
+  set(path "${FOLDER}/${other}:${FOLDER}/versioned")
+  expect(FALSE "${versioned}" find ${source})
+endforeach()
+set(path "${FOLDER}/new:${FOLDER}/versioned")
+expect(FALSE "cargo ${FOLDER}/new/cargo, rustc ${FOLDER}/new/rustc" find ${source})
+# Such a cargo in PATH runs another version where the package is broken: the folder of the version has the right one.
+make_program(${FOLDER}/broken/cargo-1.105 "cargo 1.69.0 (abcdef012 2024-01-01)" 0)
+make_program(${FOLDER}/broken/rustc-1.105 "rustc 1.105.0 (abcdef012 2024-01-01)" 0)
+set(path "${FOLDER}/old:${FOLDER}/broken")
+expect(TRUE "found cargo 1.69.0 (${FOLDER}/old/cargo)" find ${source})
+make_rust(${FOLDER}/packages/rust-1.105/bin 1.105.0 1.105.0)
+expect(FALSE "cargo ${FOLDER}/packages/rust-1.105/bin/cargo, rustc ${FOLDER}/packages/rust-1.105/bin/rustc"
+  find ${source})
+
 function(expect_target expected triple processor)
   expect(FALSE "target ${expected}." map -DTRIPLE=${triple} -DPROCESSOR=${processor})
 endfunction()
@@ -134,6 +170,21 @@ expect(TRUE "has no target aarch64-unknown-linux-gnu" target ${target} -DRUSTC=$
 set(command command ${source} -DRUSTC=${FOLDER}/full/rustc -DCARGO=/cargo)
 expect(FALSE "/cargo build --release --locked, artefacts: /build/release." ${command})
 expect(FALSE "/cargo build --release --locked --offline, artefacts: /build/release." ${command} -DAXON_CARGO_ARGS=--offline)
+# A cargo of a version is told its rustc. With all crates beside them cargo has a home in the build folder.
+expect(FALSE "CARGO_TARGET_DIR=/build RUSTC=${FOLDER}/full/rustc /cargo-1.91 build" ${command} -DCARGO=/cargo-1.91)
+expect(FALSE "CARGO_TARGET_DIR=/build RUSTC=${FOLDER}/full/rustc /usr/lib/rust-1.91/bin/cargo build"
+  ${command} -DCARGO=/usr/lib/rust-1.91/bin/cargo)
+file(MAKE_DIRECTORY ${FOLDER}/whole/axon/vendor)
+file(WRITE ${FOLDER}/whole/axon/Cargo.toml "")
+expect(FALSE "CARGO_HOME=/build/cargo-home /cargo build" ${command} -DSOURCE=${FOLDER}/whole/axon)
+axon_core_source(${FOLDER}/whole found)
+if(NOT found MATCHES "/whole/axon$")
+  message(SEND_ERROR "a source package's crates were looked for in ${found}")
+endif()
+axon_core_source(${FOLDER}/source found)
+if(found MATCHES "/source")
+  message(SEND_ERROR "a checkout's crates were looked for in ${found}")
+endif()
 list(APPEND command -DCMAKE_C_COMPILER=/bin/a-gcc -DCMAKE_CXX_COMPILER=/bin/a-g++ -DCMAKE_AR=/bin/a-ar
   -DCMAKE_SYSTEM_NAME=Linux)
 set(cross -DCMAKE_CROSSCOMPILING=TRUE -DCMAKE_SYSTEM_PROCESSOR=aarch64)
