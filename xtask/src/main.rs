@@ -14,6 +14,7 @@ mod package;
 mod picture;
 mod public_api;
 mod repeat;
+mod ros_release;
 mod rustls_axon;
 mod simulate;
 
@@ -36,6 +37,9 @@ usage: cargo xtask COMMAND
   repeat TIMES [--busy N] [NAME ...]
                        run the test suite, or the test programs with such a name, TIMES times,
                        beside N busy threads, and list the tests that failed in any run
+  ros-release [DIR] [--debian ROSDISTRO [--suite SUITE] [--rust-package 1.NN]] [--allow-dirty] [--offline]
+                       make the source package of rmw_axon, with its crates, for bloom; with --debian
+                       also what dpkg-buildpackage needs for a distribution of ROS
   simulate [--seeds N] [--hosts M] [--first SEED]
                        drive M simulated hosts through mixed faults, for each of N seeds, and shrink
                        the script of a seed that fails
@@ -73,6 +77,10 @@ fn main() -> ExitCode {
         ["public-api", "--write"] => public_api::check(rustls_axon::workspace(), Mode::Write),
         ["repeat", times, ref options @ ..] => match repeat_options(times, options) {
             Some(options) => repeat::repeat(&options),
+            None => return usage(),
+        },
+        ["ros-release", ref options @ ..] => match ros_release::Options::parse(options) {
+            Some(options) => ros_release::release(&options),
             None => return usage(),
         },
         ["simulate", ref options @ ..] => match simulate::Options::parse(options) {

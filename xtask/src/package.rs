@@ -56,13 +56,7 @@ impl<'a> Options<'a> {
 /// Makes the packages; says where they are, and how they are published.
 pub(crate) fn package(options: &Options<'_>) -> Result<String, String> {
     let root = workspace();
-    let changed = git(root, &["status", "--porcelain"]).unwrap_or_default();
-    if !options.allow_dirty && !changed.is_empty() {
-        return Err(format!(
-            "changes that are not committed would be packaged; commit them, or say --allow-dirty:\n{}",
-            changed.trim_end()
-        ));
-    }
+    refuse_dirty(root, options.allow_dirty)?;
     let target = options.target_dir.map_or_else(|| root.join("target"), Path::to_owned);
     let target = std::path::absolute(&target)
         .map_err(|err| format!("cannot use {}: {err}", target.display()))?;
@@ -97,20 +91,35 @@ pub(crate) fn package(options: &Options<'_>) -> Result<String, String> {
     ))
 }
 
-/// Makes `copy` hold the files of the workspace that git knows or would know, or without git all but
-/// build directories.
+/// Fails where there are changes that are not committed, unless that is allowed. Returns true if there are any.
+pub(crate) fn refuse_dirty(root: &Path, allow_dirty: bool) -> Result<bool, String> {
+    let changed = git(root, &["status", "--porcelain"]).unwrap_or_default();
+    if !allow_dirty && !changed.is_empty() {
+        return Err(format!(
+            "changes that are not committed would be packaged; commit them, or say --allow-dirty:\n{}",
+            changed.trim_end()
+        ));
+    }
+    Ok(!changed.is_empty())
+}
+
+/// The files of the workspace that git knows or would know, or without git all but build directories.
+pub(crate) fn copied_files(root: &Path) -> Result<Vec<String>, String> {
+    match git(root, &["ls-files", "-z", "--cached", "--others", "--exclude-standard"]) {
+        Ok(list) => {
+            Ok(list.split('\0').filter(|name| !name.is_empty()).map(str::to_owned).collect())
+        }
+        Err(_) => {
+            let mut files = Vec::new();
+            rustls_axon::walk(root, "", &mut files)?;
+            Ok(files)
+        }
+    }
+}
+
+/// Makes `copy` hold these files.
 fn copy_workspace(root: &Path, copy: &Path) -> Result<(), String> {
-    let files: Vec<String> =
-        match git(root, &["ls-files", "-z", "--cached", "--others", "--exclude-standard"]) {
-            Ok(list) => {
-                list.split('\0').filter(|name| !name.is_empty()).map(str::to_owned).collect()
-            }
-            Err(_) => {
-                let mut files = Vec::new();
-                rustls_axon::walk(root, "", &mut files)?;
-                files
-            }
-        };
+    let files = copied_files(root)?;
     if copy.exists() {
         fs::remove_dir_all(copy)
             .map_err(|err| format!("cannot remove {}: {err}", copy.display()))?;
