@@ -1,6 +1,6 @@
 //! Which files of a vendored crate are left out, and its checksums without them.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::Path;
 
@@ -76,14 +76,47 @@ fn fits(path: &str, pattern: &str) -> bool {
 
 /// Removes the files of a vendored crate that are not needed, from the folder and from its checksums.
 pub(super) fn crate_folder(package: &str, folder: &Path) -> Result<(), String> {
-    for path in below(folder)?.iter().filter(|path| *path != CHECKSUMS && !is_kept(package, path)) {
+    let files = below(folder)?;
+    let mut kept: BTreeSet<String> =
+        files.iter().filter(|path| is_kept(package, path)).cloned().collect();
+    let sources: Vec<_> = kept.iter().filter(|path| path.ends_with(".rs")).cloned().collect();
+    for source in &sources {
+        kept.extend(included(source, &read(&folder.join(source))?));
+    }
+    for path in files.iter().filter(|path| *path != CHECKSUMS && !kept.contains(*path)) {
         remove(&folder.join(path))?;
     }
     let text = read(&folder.join(CHECKSUMS))?;
-    let text = checksums(&text, |path| is_kept(package, path))
+    let text = checksums(&text, |path| kept.contains(path))
         .map_err(|why| format!("{}/{CHECKSUMS}: {why}", folder.display()))?;
     write(&folder.join(CHECKSUMS), &text)?;
     remove_empty(folder).map(drop)
+}
+
+/// The files that a source includes, as the documentation of a crate may include its examples.
+fn included(source: &str, text: &str) -> Vec<String> {
+    let mut found = Vec::new();
+    for line in text.lines().filter(|line| !line.trim_start().starts_with("//")) {
+        for part in ["include!(\"", "include_str!(\"", "include_bytes!(\""] {
+            let literals = line.split(part).skip(1).filter_map(|rest| rest.split('"').next());
+            found.extend(literals.filter_map(|literal| resolved(source, literal)));
+        }
+    }
+    found
+}
+
+/// A path that stands in a file, from the crate's folder. `None` for one that leads out of it.
+fn resolved(source: &str, relative: &str) -> Option<String> {
+    let mut parts: Vec<&str> = source.split('/').collect();
+    parts.pop();
+    for part in relative.split('/') {
+        match part {
+            "." => {}
+            ".." => drop(parts.pop()?),
+            name => parts.push(name),
+        }
+    }
+    Some(parts.join("/"))
 }
 
 /// Replaces a vendored crate by its stand-in.
@@ -193,20 +226,35 @@ mod tests {
     }
 
     #[test]
+    fn files_that_a_source_includes_are_found() {
+        let text = "#![doc = include_str!(\"../../examples/css/parser.rs\")]\n\
+            /// let bytes = include_bytes!(\"../tests/a.pem\");\n\
+            include!(\"data.rs\"); include!(concat!(env!(\"OUT_DIR\"), \"/b.rs\"));\n\
+            include_str!(\"../../../outside\")\n";
+        assert_eq!(included("src/a/mod.rs", text), ["examples/css/parser.rs", "src/a/data.rs"]);
+    }
+
+    #[test]
     fn crate_folder_has_what_its_checksums_have() {
         let folder = tempfile::tempdir().unwrap();
-        for path in ["src/lib.rs", "tests/data/large", "Cargo.toml", "Cargo.toml.orig"] {
-            let file = folder.path().join(path);
-            fs::create_dir_all(file.parent().unwrap()).unwrap();
-            fs::write(file, "").unwrap();
+        for path in ["tests/data/large", "examples/a.rs", "Cargo.toml", "Cargo.toml.orig"] {
+            write(&folder.path().join(path), "").unwrap();
         }
-        let listed =
-            r#"{"files":{"src/lib.rs":"1","tests/data/large":"2","Cargo.toml":"3"},"package":"4"}"#;
+        let source = "#![doc = include_str!(\"../examples/a.rs\")]";
+        write(&folder.path().join("src/lib.rs"), source).unwrap();
+        let listed = r#"{"files":{"src/lib.rs":"1","tests/data/large":"2","Cargo.toml":"3",
+            "examples/a.rs":"5"},"package":"4"}"#;
         fs::write(folder.path().join(CHECKSUMS), listed).unwrap();
         crate_folder("any", folder.path()).unwrap();
-        assert_eq!(below(folder.path()).unwrap(), [CHECKSUMS, "Cargo.toml", "src/lib.rs"]);
+        assert_eq!(
+            below(folder.path()).unwrap(),
+            [CHECKSUMS, "Cargo.toml", "examples/a.rs", "src/lib.rs"]
+        );
         assert!(!folder.path().join("tests").exists());
         let text = read(&folder.path().join(CHECKSUMS)).unwrap();
-        assert_eq!(text, r#"{"files":{"Cargo.toml":"3","src/lib.rs":"1"},"package":"4"}"#);
+        assert_eq!(
+            text,
+            r#"{"files":{"Cargo.toml":"3","examples/a.rs":"5","src/lib.rs":"1"},"package":"4"}"#
+        );
     }
 }
