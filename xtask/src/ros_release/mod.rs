@@ -208,11 +208,14 @@ fn clear(dir: &Path) -> Result<(), String> {
             dir.display()
         ));
     }
-    for path in there {
+    // The marker stays, so that a run that is interrupted here is no hindrance.
+    for path in there.into_iter().filter(|path| !path.ends_with(MARKER)) {
         let removed =
             if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
         removed.map_err(|err| format!("cannot remove {}: {err}", path.display()))?;
     }
+    // A checkout in a workspace of colcon would have two packages of one name.
+    write(&dir.join("COLCON_IGNORE"), "")?;
     write(&dir.join(MARKER), "")
 }
 
@@ -258,6 +261,7 @@ mod tests {
         write(&out.join("rmw_axon-0.1.0/a"), "").unwrap();
         clear(&out).unwrap();
         assert!(out.join(MARKER).exists() && !out.join("rmw_axon-0.1.0").exists());
+        assert!(out.join("COLCON_IGNORE").exists());
 
         let theirs = dir.path().join("theirs");
         write(&theirs.join("thesis.tex"), "").unwrap();

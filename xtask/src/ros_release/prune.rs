@@ -8,9 +8,11 @@ use serde_json::{Map, Value};
 
 use super::files::{below, read, remove, write};
 
-/// Folders that hold no source of a library, at the top of a crate. Names that begin so are meant too.
-const UNUSED: [&str; 8] =
-    ["tests", "test-", "testdata", "benches", "benchmark", "examples", "fuzz", "ci"];
+/// Folders at the top of a crate that hold no source of a library.
+const UNUSED: [&str; 3] = ["testdata", "fuzz", "ci"];
+
+/// How the names of more such folders begin.
+const UNUSED_STARTS: [&str; 4] = ["tests", "test-", "bench", "example"];
 
 /// Parts of paths that are for other platforms or for tests alone, of crates where this is much.
 const UNUSED_OF: [(&str, &[&str]); 3] = [
@@ -53,9 +55,7 @@ pub(super) fn is_kept(package: &str, path: &str) -> bool {
         return true;
     }
     if let Some((folder, _)) = path.split_once('/')
-        && UNUSED
-            .iter()
-            .any(|unused| folder == *unused || unused.len() > 4 && folder.starts_with(unused))
+        && (UNUSED.contains(&folder) || UNUSED_STARTS.iter().any(|start| folder.starts_with(start)))
     {
         return false;
     }
