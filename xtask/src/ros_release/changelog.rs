@@ -9,7 +9,7 @@ pub(super) struct Section {
     items: Vec<String>,
 }
 
-/// What stands for the changes since the last version.
+/// The heading of the changes since the last version.
 const FORTHCOMING: &str = "Forthcoming";
 
 /// The changelog in which `version` has a section; true if that one was called Forthcoming. Other changes under
@@ -68,7 +68,7 @@ pub(super) fn sections(text: &str) -> Result<Vec<Section>, String> {
     Ok(sections)
 }
 
-/// The lines that are underlined with dashes.
+/// Returns the indices of the lines that are underlined with dashes.
 fn headings(lines: &[&str]) -> Vec<usize> {
     let is_rule = |line: &&str| line.len() > 2 && line.chars().all(|c| c == '-');
     (0..lines.len().saturating_sub(1))

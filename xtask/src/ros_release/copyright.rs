@@ -1,4 +1,4 @@
-//! `debian/copyright` and `NOTICES`: whose the sources are, and under which licences.
+//! `debian/copyright` and `NOTICES`: copyright holders and licences of all sources.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -34,7 +34,7 @@ pub(super) struct Legal {
     pub(super) identifiers: BTreeSet<String>,
 }
 
-/// Collects what the crates in the source package say.
+/// Collects holders, licences and texts of the crates in the source package.
 pub(super) fn collect(
     tree: &Path,
     crates: &[Crate],
@@ -86,7 +86,7 @@ pub(super) fn collect(
     })
 }
 
-/// The lines that say whose it is.
+/// Returns the lines that name a copyright holder.
 fn holders(text: &str) -> Vec<String> {
     let is_holder = |line: &&str| {
         let rest = line.strip_prefix("Copyright").unwrap_or_default();

@@ -83,7 +83,7 @@ fn control(package: &Package, target: Target<'_>) -> String {
     )
 }
 
-/// What has `cargo` or `rustc`. Debian's `cargo-web` provides `cargo` in its version.
+/// The build dependency for `cargo` or `rustc`. Debian's `cargo-web` provides `cargo` in its version.
 fn rust(tool: &str, target: Target<'_>) -> String {
     let least = target.rust;
     match target.rust_package {
@@ -96,7 +96,7 @@ fn rules(name: &str, rosdistro: &str) -> String {
     RULES.replace("@prefix@", &format!("/opt/ros/{rosdistro}")).replace("@package@", name)
 }
 
-/// What the rules of bloom's template do. The core is built without a network and without anything in the home.
+/// The rules of bloom's template, without its comments.
 const RULES: &str = r#"#!/usr/bin/make -f
 export DH_VERBOSE=1
 export LDFLAGS=
@@ -154,7 +154,7 @@ mod tests {
         Target { rosdistro: "jazzy", suite: "noble", rust: "1.88", rust_package: None };
 
     #[test]
-    fn control_names_what_a_build_and_a_user_need() {
+    fn control_names_dependencies_of_build_and_run() {
         assert_eq!(
             control(&package(), TARGET),
             "Source: ros-jazzy-rmw-axon\nSection: misc\nPriority: optional\n\

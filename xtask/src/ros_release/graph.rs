@@ -1,4 +1,4 @@
-//! Which crates a build on Linux compiles, and what they say of themselves.
+//! The crates that a build on Linux compiles, with licence, authors and Rust version.
 
 use std::collections::BTreeSet;
 
@@ -7,7 +7,7 @@ use serde_json::Value;
 /// The platforms of the source package.
 pub(super) const PLATFORMS: [&str; 2] = ["x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu"];
 
-/// What the C library and the daemon are built from.
+/// The packages that a build names: the C library and the daemon.
 pub(super) const ROOTS: [&str; 2] = ["rmw-axon-core", "axon-daemon"];
 
 /// A crate of the registry that is compiled.

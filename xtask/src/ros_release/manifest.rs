@@ -117,7 +117,7 @@ mod tests {
     }
 
     #[test]
-    fn members_lose_what_only_tests_need() {
+    fn members_lose_sections_that_only_tests_need() {
         let text = "[package]\nname = \"a\"\n\n[dependencies]\nb = \"1\"\n\n[dev-dependencies]\n\
             # Why.\nc = \"1\"\n\n[target.'cfg(unix)'.dev-dependencies]\nd = \"1\"\n\n[[test]]\nname = \"t\"\n\n\
             # The daemon.\n[[bin]]\nname = \"a\"\npath = \"src/a.rs\"\n";

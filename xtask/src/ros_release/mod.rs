@@ -1,7 +1,7 @@
 //! The source package of `rmw_axon`, which bloom and the ROS build farm take: it builds without a network.
 //!
 //! [`layout`] says which file goes where, [`manifest`] makes the crates' manifests smaller, [`vendor`] and [`prune`]
-//! bring the registry's crates, [`changelog`], [`package_xml`], [`debian`] and [`copyright`] make what packagers read.
+//! bring the registry's crates, [`changelog`], [`package_xml`], [`debian`] and [`copyright`] make the files for packagers.
 
 mod archive;
 mod changelog;
@@ -24,7 +24,7 @@ use super::package::{self, copied_files};
 use super::rustls_axon::{self, git, workspace};
 use files::{change, read, write};
 
-/// What to make, and where.
+/// The arguments of the command.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(crate) struct Options<'a> {
     /// `target/ros-release` unless told otherwise.
@@ -75,7 +75,7 @@ impl<'a> Options<'a> {
     }
 }
 
-/// Says that a folder is one that this command may replace.
+/// A file in a folder that this command made and may replace.
 const MARKER: &str = ".made-by-xtask-ros-release";
 
 /// Makes the source package; says what it has, how large it is, and what to do with it.
@@ -254,7 +254,7 @@ mod tests {
     }
 
     #[test]
-    fn second_run_replaces_what_the_first_made_and_nothing_else() {
+    fn second_run_replaces_files_of_the_first_run_only() {
         let dir = tempfile::tempdir().unwrap();
         let out = dir.path().join("out");
         clear(&out).unwrap();

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use roxmltree::{Document, Node};
 
-/// What Debian's files are made from.
+/// The fields of `package.xml` that Debian's files need.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) struct Package {
     pub(super) name: String,
@@ -17,7 +17,7 @@ pub(super) struct Package {
     pub(super) build: BTreeSet<String>,
     /// Those that tests need as well.
     pub(super) test: BTreeSet<String>,
-    /// Those that whoever uses the package needs.
+    /// Keys that a program with this package needs.
     pub(super) run: BTreeSet<String>,
 }
 

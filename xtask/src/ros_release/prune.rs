@@ -235,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn crate_folder_has_what_its_checksums_have() {
+    fn crate_folder_matches_its_checksums() {
         let folder = tempfile::tempdir().unwrap();
         for path in ["tests/data/large", "examples/a.rs", "Cargo.toml", "Cargo.toml.orig"] {
             write(&folder.path().join(path), "").unwrap();

@@ -12,7 +12,7 @@ use super::graph::{self, Crate, PLATFORMS, ROOTS};
 use super::{lock, manifest, prune};
 use crate::rustls_axon::cargo;
 
-/// What the vendored crates are.
+/// Summary of the vendored crates.
 #[derive(Debug)]
 pub(super) struct Vendored {
     /// Those that are compiled on one of the platforms.
@@ -63,7 +63,7 @@ pub(super) fn vendor(workspace: &Path, is_offline: bool) -> Result<Vendored, Str
     Ok(Vendored { compiled, stand_ins, bytes: (before, size(&folder)?) })
 }
 
-/// What tells cargo to use `vendor/`, and nothing else.
+/// Cargo's configuration: sources come from `vendor/` alone.
 const CONFIG: &str = "[source.crates-io]\nreplace-with = \"vendored-sources\"\n\n\
     [source.vendored-sources]\ndirectory = \"vendor\"\n\n[net]\noffline = true\n";
 
