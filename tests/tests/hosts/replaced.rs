@@ -6,7 +6,7 @@ use std::{
     time::Duration,
 };
 
-use axon_transport::{EndpointSpec, qos::Qos};
+use axon_transport::{EndpointSpec, Session, qos::Qos};
 
 use super::{
     mode::{Kmes, classic},
@@ -24,9 +24,16 @@ fn in_all(test: impl Fn([Host; 2])) {
     test(Plan::new([0, 1].map(|host| kmes.settings(host, &more))).start());
 }
 
-/// Pauses before the next writer leaves, so that the graph is at various points of its way.
-fn pause(round: u64) {
-    thread::sleep(Duration::from_millis(round % 12 * 5));
+/// Has an endpoint come in each round at the moment at which the one before it leaves. The pauses differ, so that the
+/// graph is at various points of its way.
+fn in_turn<E>(host: &Host, mut come: impl FnMut(&Session, u64) -> E) {
+    let sessions = [host.session("one"), host.session("other")];
+    let mut before = None;
+    for round in 0..ROUNDS {
+        thread::sleep(Duration::from_millis(round % 12 * 5));
+        drop(before.take());
+        before = Some(come(&sessions[round as usize % 2], round));
+    }
 }
 
 #[test]
@@ -46,12 +53,7 @@ fn call_of_a_new_client_is_served_though_the_last_other_client_left() {
                     }
                 }
             });
-            let sessions = [b.session("one"), b.session("other")];
-            let mut before = None;
-            for round in 0..ROUNDS {
-                let session = &sessions[round as usize % 2];
-                pause(round);
-                drop(before.take());
+            in_turn(&b, |session, round| {
                 let client = session.create_client(spec()).unwrap();
                 assert!(client.wait_available(PATIENCE), "round {round}");
                 let number = client.send_request(&round.to_be_bytes()).unwrap();
@@ -59,8 +61,8 @@ fn call_of_a_new_client_is_served_though_the_last_other_client_left() {
                 let info = client.recv_response(&mut response, Some(PATIENCE));
                 let info = info.unwrap_or_else(|error| panic!("round {round}: {error}"));
                 assert_eq!((info.sequence, &response[..]), (number, &round.to_be_bytes()[..]));
-                before = Some(client);
-            }
+                client
+            });
             is_over.store(true, Ordering::Relaxed);
         });
     });
@@ -72,12 +74,7 @@ fn sample_of_a_new_publisher_arrives_though_the_last_other_publisher_left() {
         let spec = || EndpointSpec::new("/topic", "test/Bytes", Qos::keep_all());
         let there = a.session("subscription");
         let subscription = there.create_subscription(spec()).unwrap();
-        let sessions = [b.session("one"), b.session("other")];
-        let mut before = None;
-        for round in 0..ROUNDS {
-            let session = &sessions[round as usize % 2];
-            pause(round);
-            drop(before.take());
+        in_turn(&b, |session, round| {
             let publisher = session.create_publisher(spec()).unwrap();
             assert!(publisher.wait_matched(1, PATIENCE), "round {round}");
             publisher.publish(&round.to_be_bytes()).unwrap();
@@ -85,8 +82,8 @@ fn sample_of_a_new_publisher_arrives_though_the_last_other_publisher_left() {
             let info = subscription.recv(&mut bytes, Some(PATIENCE));
             info.unwrap_or_else(|error| panic!("round {round}: {error}"));
             assert_eq!(bytes[..], round.to_be_bytes());
-            before = Some(publisher);
-        }
+            publisher
+        });
         assert_eq!(subscription.lost(), 0);
     });
 }
