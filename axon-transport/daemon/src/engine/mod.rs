@@ -369,7 +369,12 @@ impl Engine {
         };
         match message {
             LinkMessage::Graph(graph) => match peer.take_graph(graph) {
-                GraphTaken::Changed { .. } => peer.stirred = true,
+                GraphTaken::Changed { whole } => {
+                    peer.stirred = true;
+                    if whole {
+                        self.peers.with(daemon, |peer, with| peer.unserve_unrepeated(with, now));
+                    }
+                }
                 GraphTaken::Part => {}
                 GraphTaken::Gap => {
                     let version = peer.remote.version();

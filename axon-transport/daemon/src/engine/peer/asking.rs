@@ -71,6 +71,8 @@ impl Peer {
     /// because the peer still serves the route, so the route must not end because the one before it left.
     fn keep_asked(&self, wanted: &mut BTreeMap<RouteKey, WantedRoute>, with: &PeerContext<'_>) {
         let most = self.asked.most();
+        // A route that is not needed now may take the place of one that is.
+        let lacks_room = !self.refused.unserved_without_time(1).is_empty();
         for (key, asked) in self.asked.iter().filter(|(key, _)| key.kind != Kind::Response) {
             let before = wanted.get(key);
             let lacks = |reader: &&RouteSubscriber| {
@@ -78,7 +80,8 @@ impl Peer {
                 !is_wanted && with.local.contains_key(&reader.gid)
             };
             let readers: Vec<_> = asked.wanted.subscribers.iter().filter(lacks).cloned().collect();
-            let has_room = before.is_some() || wanted.len() < most;
+            let has_room = before.is_some()
+                || wanted.len() < most && !lacks_room && !self.refused.is_unserved(key);
             if readers.is_empty() || !has_room || !self.may_come_again(key, asked, before) {
                 continue;
             }
@@ -95,9 +98,7 @@ impl Peer {
         asked: &AskedRoute,
         wanted: Option<&WantedRoute>,
     ) -> bool {
-        let is_wanted = |gid: &Gid| {
-            wanted.is_some_and(|route| route.writers.iter().any(|(w, _)| w.gid == *gid))
-        };
+        let is_wanted = |gid: &Gid| wanted.is_some_and(|route| route.has_writer(gid));
         let writers = asked.wanted.writers.iter().map(|(writer, _)| writer.gid);
         let left = writers.filter(|gid| !is_wanted(gid)).all(|gid| self.remote.get(&gid).is_none());
         let verb = if key.kind == Kind::Topic { Verb::Publish } else { Verb::Call };
@@ -359,8 +360,11 @@ impl Peer {
     /// request route that the peer refuses to serve is left out.
     fn unasked_responses(&self) -> BTreeSet<RouteKey> {
         let requests = self.asked.iter().filter(|(key, _)| key.kind == Kind::Request);
-        let unasked = requests.filter(|(key, _)| {
-            self.served.number_of(&key.other_way()).is_none() && !self.refused.is_unserved(key)
+        // A route without a client has no responses.
+        let unasked = requests.filter(|(key, asked)| {
+            !asked.stand_ins.is_empty()
+                && self.served.number_of(&key.other_way()).is_none()
+                && !self.refused.is_unserved(key)
         });
         unasked.map(|(key, _)| key.clone()).collect()
     }

@@ -374,11 +374,7 @@ impl Peer {
 
     /// Takes in a part of the peer's graph.
     pub(super) fn take_graph(&mut self, graph: GraphUpdate) -> GraphTaken {
-        let taken = self.remote.take(graph);
-        if taken == (GraphTaken::Changed { whole: true }) {
-            self.unserve_unrepeated();
-        }
-        taken
+        self.remote.take(graph)
     }
 
     /// Handles a change of the peer's graph.

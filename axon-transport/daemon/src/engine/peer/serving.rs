@@ -219,10 +219,13 @@ impl Peer {
         self.outbound.end_route(route);
     }
 
-    /// Ends a route whose number belongs to an earlier link. The end of that link was seen by the peer alone, which asks
-    /// for its routes under other numbers now. What it did not acknowledge waits for that.
+    /// Ends a route that the peer asked for over an earlier link, and may be about to ask for again under another number:
+    /// the peer alone saw the end of that link. The samples that it did not acknowledge are kept for that.
     fn unserve_earlier(&mut self, route: u32, with: &PeerContext<'_>, now: Duration) {
-        if let Some(served) = self.served.get_mut(route) {
+        if let Some(served) = self.served.get_mut(route)
+            && served.key.kind == Kind::Topic
+            && served.subscribers.iter().any(|reader| self.remote.get(reader).is_some())
+        {
             let mut kept = with.kept.borrow_mut();
             kept.add_route(&self.identity, route, served, &mut self.outbound, now);
         }
@@ -230,10 +233,10 @@ impl Peer {
     }
 
     /// Ends the routes that the peer did not ask for again over the link in use.
-    pub(super) fn unserve_unrepeated(&mut self) {
+    pub(in crate::engine) fn unserve_unrepeated(&mut self, with: &PeerContext<'_>, now: Duration) {
         let unrepeated = self.served.iter().filter(|(_, served)| !served.repeated);
         let lost: Vec<_> = unrepeated.map(|(route, _)| route).collect();
-        lost.into_iter().for_each(|route| self.unserve(route));
+        lost.into_iter().for_each(|route| self.unserve_earlier(route, with, now));
     }
 
     /// Opens the relays of a topic, and leaves relays open that the route already has. `places` and `lanes` are the

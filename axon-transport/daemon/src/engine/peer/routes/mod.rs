@@ -57,6 +57,11 @@ impl WantedRoute {
     pub(in crate::engine::peer) fn has_reader(&self, gid: &Gid) -> bool {
         self.subscribers.binary_search_by_key(gid, |reader| reader.gid).is_ok()
     }
+
+    /// Returns whether this writer is among its writers.
+    pub(in crate::engine::peer) fn has_writer(&self, gid: &Gid) -> bool {
+        self.writers.binary_search_by_key(gid, |(writer, _)| writer.gid).is_ok()
+    }
 }
 
 /// Matches a peer's writers with this host's readers, as far as the ranges of their sessions permit.
