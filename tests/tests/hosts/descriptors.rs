@@ -15,7 +15,9 @@ fn open(host: &Host) -> u64 {
 #[test]
 fn session_that_another_host_uses_takes_no_further_descriptor_of_its_daemon() {
     const SESSIONS: usize = 16;
-    let spec = || EndpointSpec::new("/descriptors", "test/Bytes", Qos::default());
+    // The subscription keeps a sample of each publisher, however late it takes them.
+    let qos = Qos::default().with_depth(SESSIONS as u32);
+    let spec = || EndpointSpec::new("/descriptors", "test/Bytes", qos);
     let hosts = Plan::new([classic(&[]), classic(&[])]).start();
     let sessions: Vec<_> = (0..SESSIONS).map(|_| hosts[0].session("publisher")).collect();
     // The descriptors of the link itself are open once the first session's publisher is matched.
