@@ -27,7 +27,7 @@ pub(super) type Use = (Verb, String);
 /// The owner of an endpoint.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Owner<'a> {
-    /// The daemon's user, whom no rule concerns.
+    /// The daemon's user. No rule applies to this user.
     Own,
     /// Another user of this host.
     User(u32),

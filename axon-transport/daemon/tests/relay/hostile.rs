@@ -424,8 +424,8 @@ fn unrequested_responses_of_a_hostile_server_reach_no_client() {
     say_to(&socket, &answer(own, client.gid(), 10, 11));
     assert!(hear(&socket, |_| false).is_none());
 
-    // A response in the name of another server is dropped, and so is one before the server says whom it answers. A
-    // response to a client with which it is not matched is dropped as well, and is done with at once.
+    // The daemon drops a response in the name of another server. It drops a response of a server that has not named its
+    // clients yet. It also drops a response to a client that is not matched, and gives the credit for it back at once.
     let stranger = Gid([5; 16]);
     let socket = server_for(&host, own, vec![stranger]);
     say_to(&socket, &answer(server.gid(), client.gid(), 4, 4));
