@@ -34,7 +34,10 @@ use axon_transport::{
     config::{Config, DaemonPolicy, security_settings},
     ids::SessionId,
     internal::{
-        session::daemon::{address::Address, socket},
+        session::daemon::{
+            address::{Address, AddressError},
+            socket,
+        },
         wire::session::{
             PROTOCOL, Segment, SegmentOpened, SessionHello, SessionMessage, SessionRole,
         },
