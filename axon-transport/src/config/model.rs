@@ -83,9 +83,15 @@ impl Config {
     }
 
     /// Returns whether small RELIABLE samples of a topic, or small requests and responses of a service, may cross both paths
-    /// to a host.
+    /// to a host. In `messages10` they do only if a rule asks for it.
     pub fn topic_redundancy(&self, name: &str) -> bool {
-        topics::first(&self.topics, name).is_none_or(|rule| rule.redundant)
+        let rule = topics::first(&self.topics, name).and_then(|rule| rule.redundant);
+        rule.unwrap_or_else(|| !self.seals_messages())
+    }
+
+    /// Returns whether each message between hosts has an envelope under a KME key (`messages10`).
+    fn seals_messages(&self) -> bool {
+        matches!(&self.security, Security::Qkd(qkd) if qkd.key_mode == KeyMode::Messages10)
     }
 
     /// Returns the limit that `max_hz` sets for the samples of a topic to each other host.

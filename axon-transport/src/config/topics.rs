@@ -22,15 +22,16 @@ pub struct TopicRule {
     pub max_hz: Option<f64>,
     /// Compression of samples for other hosts. It applies only if `[link] compression` enables compression.
     pub compression: LinkCompression,
-    /// True if RELIABLE samples, requests and responses of at most 4 KiB also leave over the second path to a host. It applies only if `[link]
-    /// paths` is 2.
-    pub redundant: bool,
+    /// True if RELIABLE samples, requests and responses of at most 4 KiB also leave over the second path to a host, false if
+    /// they do not. It applies only if `[link] paths` is 2. `None`: true, but false in `messages10`, where a copy uses up a
+    /// tenth of a KME key.
+    pub redundant: Option<bool>,
 }
 
 impl TopicRule {
     /// Creates a rule that gives this priority to the topics and services whose names fit.
     pub const fn new(name: TopicPattern, priority: TopicPriority) -> Self {
-        Self { name, priority, max_hz: None, compression: LinkCompression::Auto, redundant: true }
+        Self { name, priority, max_hz: None, compression: LinkCompression::Auto, redundant: None }
     }
 
     /// Disables compression of the samples.
@@ -43,7 +44,14 @@ impl TopicRule {
     /// Sends each sample over one path only.
     #[must_use]
     pub const fn over_one_path(mut self) -> Self {
-        self.redundant = false;
+        self.redundant = Some(false);
+        self
+    }
+
+    /// Sends each small RELIABLE sample over both paths, also in `messages10`.
+    #[must_use]
+    pub const fn over_both_paths(mut self) -> Self {
+        self.redundant = Some(true);
         self
     }
 
@@ -87,7 +95,7 @@ fn rule(entry: toml::Value, place: &str) -> Result<TopicRule, ConfigError> {
         return Err(ConfigError::name("topic", "entries that begin with [[topic]]").at(place));
     };
     let (mut name, mut priority, mut max_hz) = (None, TopicPriority::Normal, None);
-    let (mut compression, mut redundant) = (LinkCompression::Auto, true);
+    let (mut compression, mut redundant) = (LinkCompression::Auto, None);
     for (key, value) in entry {
         let read = value.as_str().unwrap_or_else(|| value.type_str());
         match key.as_str() {
@@ -123,7 +131,7 @@ fn rule(entry: toml::Value, place: &str) -> Result<TopicRule, ConfigError> {
             "redundant" => {
                 let wrong =
                     || ConfigError::value("topic.redundant", read, "true or false").at(place);
-                redundant = value.as_bool().ok_or_else(wrong)?;
+                redundant = Some(value.as_bool().ok_or_else(wrong)?);
             }
             _ => {
                 let name = format!("topic.{key}");

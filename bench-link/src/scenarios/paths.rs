@@ -16,6 +16,9 @@ use crate::{
     table::Table,
 };
 
+/// The settings of both hosts. Without the entries, `messages10` sends no copies.
+const TWO_PATHS: &str = "paths = 2\n\n[[topic]]\nname = '/there'\nredundant = true\n\n\
+                         [[topic]]\nname = '/back'\nredundant = true\n";
 /// How long samples flow if nothing else is said.
 const TIME: Duration = Duration::from_secs(60);
 /// How long the hosts have to link over the second path.
@@ -53,7 +56,7 @@ pub(crate) fn paths(options: &Options) -> Result<Value> {
         ">with a second link",
     ];
     let table = Table::new(&header);
-    let plan = Plan { link: "paths = 2\n", paths: 2, ..options.plan.clone() };
+    let plan = Plan { link: TWO_PATHS, paths: 2, ..options.plan.clone() };
     let mut figures = Vec::new();
     for beside in ["nothing", "bulk"] {
         let mut place = Place::new(options.path, &plan)?;

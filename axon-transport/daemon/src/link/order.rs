@@ -110,7 +110,7 @@ impl MessageOrder {
             (LinkMessage::SwitchOver, OrderStep::Standby | OrderStep::Open) => !self.peer_elects,
             (LinkMessage::Keepalive, step) => step != OrderStep::Hello,
             // Key announcements exist in qkd alone.
-            (LinkMessage::Keys(_), OrderStep::Open) => self.qkd,
+            (LinkMessage::Keys(_), OrderStep::Standby | OrderStep::Open) => self.qkd,
             (LinkMessage::Elected(_), OrderStep::Open) => false,
             (_, OrderStep::Open) => true,
             _ => false,

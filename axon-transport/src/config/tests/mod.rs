@@ -482,3 +482,30 @@ fn the_first_entry_of_a_topic_counts() {
         assert_eq!(config.topic_redundancy(name), name != "/tf", "{name}");
     }
 }
+
+/// A copy of a sample uses up a tenth of a KME key.
+#[test]
+fn messages10_sends_copies_only_where_a_topic_asks_for_them() {
+    for (mode, default) in [("session", true), ("messages10", false)] {
+        let rules = "
+            [[topic]]
+            name = '/yes'
+            redundant = true
+
+            [[topic]]
+            name = '/no'
+            redundant = false
+
+            [[topic]]
+            name = '/either'
+            priority = 'high'
+        ";
+        let mut variables = QKD.to_vec();
+        variables.push(("AXON_QKD_KEY_MODE", mode));
+        let config = with_file(&variables, rules).unwrap();
+        let expected = [("/yes", true), ("/no", false), ("/either", default), ("/other", default)];
+        for (name, redundant) in expected {
+            assert_eq!(config.topic_redundancy(name), redundant, "{mode}, {name}");
+        }
+    }
+}

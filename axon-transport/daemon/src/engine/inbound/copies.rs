@@ -16,15 +16,12 @@ use bytes::{Buf, Bytes};
 use super::{
     Inbound, LinkViolation, StreamKey,
     incoming::{IncomingStream, OpenedMessage, StreamStep},
-    reading::{StepOutcome, malformed, wait},
+    reading::{StepOutcome, wait},
 };
 use crate::{
     engine::{
         rank::SMALL,
-        sample::{
-            dropped::EarlierFate,
-            protection::{MAX_OVERHEAD, Open},
-        },
+        sample::{dropped::EarlierFate, protection::MAX_OVERHEAD},
     },
     link::CloseCode,
 };
@@ -109,17 +106,6 @@ impl Copies {
     /// Handles that the samples up to this number came over the link in use.
     pub(super) fn handle_sample(&mut self, flow: (u32, Gid), number: u64) {
         self.delivered.retain(|(of, newest)| *of != flow || *newest > number);
-    }
-}
-
-/// Checks that a link may carry copies.
-///
-/// # Errors
-/// Its messages have envelopes of their own, which copies lack.
-pub(super) fn permit_copy(open: &Open<'_>) -> Result<(), LinkViolation> {
-    match open {
-        Open::Link => Ok(()),
-        Open::Envelope { .. } => Err(malformed("a copy of a sample without an envelope")),
     }
 }
 

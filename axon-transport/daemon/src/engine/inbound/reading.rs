@@ -8,7 +8,7 @@ use bytes::Bytes;
 
 use super::{
     ARRIVAL, ENDED, Inbound, LONG_MESSAGE_BYTES, LinkViolation, NO_ROUTE, StreamKey, TURN,
-    copies::{AFTER, permit_copy, permit_length, read_after},
+    copies::{AFTER, permit_length, read_after},
     incoming::{IncomingStream, OpenedMessage, Piece, StreamStep},
 };
 use crate::engine::sample::stream_header::{HEADER, StreamHeader};
@@ -116,7 +116,6 @@ impl Inbound {
             StreamStep::Election => {
                 let Some((header, _)) = stream.header else { return Ok(StepOutcome::Over) };
                 if header.copy {
-                    permit_copy(open)?;
                     stream.step = StreamStep::After;
                     return Ok(StepOutcome::Go);
                 }
@@ -267,6 +266,9 @@ impl Inbound {
             return Ok(StepOutcome::Go);
         }
         let Some((opened, payload)) = open_body(open, body, route, now).map_err(refused)? else {
+            if header.copy {
+                return Ok(StepOutcome::Over);
+            }
             self.lost("no_link", header, ENDED, now);
             self.release(stream);
             return Ok(StepOutcome::Go);

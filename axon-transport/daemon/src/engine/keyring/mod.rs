@@ -209,6 +209,21 @@ impl Keyring {
         Ok(())
     }
 
+    /// Lets copies of messages leave over a connection that stands by.
+    ///
+    /// # Errors
+    /// The connection has no receiver, or the SAE IDs make no channel.
+    pub(crate) fn attach_standby(
+        &mut self,
+        now: Duration,
+        connection: u64,
+        exporters: &Exporters,
+    ) -> Result<(), SupplyError> {
+        let number = self.attached(connection)?;
+        self.touch(number);
+        self.peers[number].sender.attach_standby(now, connection, exporters)
+    }
+
     /// Forgets a connection that ended, or that failed before it became a link.
     pub(crate) fn forget_connection(&mut self, now: Duration, connection: u64) {
         let Some(number) = self.connections.remove(&connection) else { return };

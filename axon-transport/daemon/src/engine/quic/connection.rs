@@ -6,7 +6,7 @@ use std::{
     time::Duration,
 };
 
-use axon_envelope::{Delivery, Route};
+use axon_envelope::Route;
 use axon_transport::status::LinkStatus;
 use quinn_proto::{ConnectionHandle, StreamId, Transmit};
 use rustls_pki_types::CertificateDer;
@@ -297,8 +297,8 @@ pub(crate) struct Carrier<'a> {
 }
 
 impl Carrier<'_> {
-    /// Copies a sample for the second path. A sample that has an envelope of its own is not copied: the envelope is
-    /// bound to its connection, and without one the sample would be less protected.
+    /// Copies a sample for the second path. Where samples have envelopes, the copy has one of its own, because envelopes are
+    /// bound to their connection. It does not leave if it has no key.
     pub(in crate::engine) fn copy(
         &mut self,
         header: StreamHeader,
@@ -307,12 +307,8 @@ impl Carrier<'_> {
         after: u64,
         now: Duration,
     ) {
-        if !matches!(self.seal, Seal::Link) {
-            return;
-        }
         let mut frames = Frames::default();
-        let sealed = Seal::Link.write(sample, route, Delivery::Reliable, None, &mut frames, now);
-        if sealed.is_ok() {
+        if self.seal.write_copy(sample, route, self.copies.connection, &mut frames, now).is_ok() {
             let frames = frames.take();
             self.copies.copies.push(SampleCopy { header, after, frames });
         }

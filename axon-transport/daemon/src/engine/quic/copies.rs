@@ -27,6 +27,8 @@ const PING: Duration = Duration::from_secs(1);
 /// Time, and number of round trips, after which a copy is given up. Its sample has arrived over the link in use, or the
 /// peer lacks the sample before it.
 const LIFE: (Duration, u32) = (Duration::from_secs(1), 4);
+/// Longest time after which a copy is given up. In messages10 the peer keeps the key of a copy for 5 s after its RETIRE.
+const LONGEST_LIFE: Duration = Duration::from_secs(4);
 
 /// A copy that is to leave.
 #[derive(Debug)]
@@ -42,6 +44,8 @@ pub(in crate::engine) struct SampleCopy {
 /// The copies of one pass.
 #[derive(Debug, Default)]
 pub(in crate::engine) struct CopyBatch {
+    /// The connection that stands by.
+    pub(in crate::engine) connection: u64,
     /// Number of copies that the second path takes.
     pub(in crate::engine) room: usize,
     pub(in crate::engine) copies: Vec<SampleCopy>,
@@ -202,7 +206,7 @@ fn most_bytes(quic: &Connection) -> usize {
 }
 
 fn life(round_trip: Duration) -> Duration {
-    LIFE.0.max(LIFE.1 * round_trip)
+    LIFE.0.max(LIFE.1 * round_trip).min(LONGEST_LIFE)
 }
 
 fn silent_after(round_trip: Duration) -> Duration {

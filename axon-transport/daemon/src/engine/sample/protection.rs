@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use axon_envelope::{Delivery, Kind, OpenError, Route, TAG_LEN, inner};
+use axon_envelope::{Delivery, Kind, OpenError, Route, Slot, TAG_LEN, inner};
 use axon_shm::ids::Gid;
 use bytes::Bytes;
 
@@ -91,22 +91,59 @@ impl Seal<'_> {
                 if sender.attached() != Some(*connection) {
                     return Err(NoKey::Detached);
                 }
-                let header = header(sample, now).encode();
-                let slot = sender.slot(now, delivery)?;
-                let length = slot.overhead() + header.len() + sample.payload.len();
-                frames.append(LENGTH + length, |frame| {
-                    frame.extend_from_slice(&(length as u32).to_be_bytes());
-                    // The message is sealed in the buffer from which it is sent.
-                    let at = frame.len();
-                    frame.resize(at + slot.header_len(), 0);
-                    frame.extend_from_slice(&header);
-                    frame.extend_from_slice(&sample.payload);
-                    frame.resize(at + length, 0);
-                    slot.seal_in_place(route, &mut frame[at..]).map_err(|_| NoKey::None)
-                })
+                envelope(sender.slot(now, delivery)?, sample, route, frames, now)
             }
         }
     }
+
+    /// Adds the copy of a message that leaves over `connection`, which stands by.
+    ///
+    /// # Errors
+    /// There is no key for the copy. Nothing is added then.
+    pub(crate) fn write_copy(
+        &mut self,
+        sample: &RingSample,
+        route: Route,
+        connection: u64,
+        frames: &mut Frames,
+        now: Duration,
+    ) -> Result<(), NoKey> {
+        match self {
+            Self::Link => {
+                plain(&header(sample, now).encode(), &sample.payload, frames);
+                Ok(())
+            }
+            Self::Envelope { sender, .. } => {
+                sender.demand_copies(now, 1);
+                envelope(sender.copy_slot(now, connection)?, sample, route, frames, now)
+            }
+        }
+    }
+}
+
+/// Adds a message in its envelope.
+///
+/// # Errors
+/// The key cannot seal it. Nothing is added then.
+fn envelope(
+    slot: Slot<'_>,
+    sample: &RingSample,
+    route: Route,
+    frames: &mut Frames,
+    now: Duration,
+) -> Result<(), NoKey> {
+    let header = header(sample, now).encode();
+    let length = slot.overhead() + header.len() + sample.payload.len();
+    frames.append(LENGTH + length, |frame| {
+        frame.extend_from_slice(&(length as u32).to_be_bytes());
+        // The message is sealed in the buffer from which it is sent.
+        let at = frame.len();
+        frame.resize(at + slot.header_len(), 0);
+        frame.extend_from_slice(&header);
+        frame.extend_from_slice(&sample.payload);
+        frame.resize(at + length, 0);
+        slot.seal_in_place(route, &mut frame[at..]).map_err(|_| NoKey::None)
+    })
 }
 
 /// Adds a message that has no envelope.

@@ -15,6 +15,8 @@ const FIRST_LEAD: Duration = Duration::from_millis(100);
 const QUICK: Duration = Duration::from_secs(1);
 /// Time constant of the demand that is compared with the supply.
 const STEADY: Duration = Duration::from_secs(10);
+/// Keys per second below which no copies are sent any more. One copy counts for two seconds.
+const SOME: f64 = 0.01;
 /// Share of the supply above which the demand is too close to it.
 const CLOSE: f64 = 0.8;
 /// Minimum time between two warnings.
@@ -97,6 +99,11 @@ impl Demand {
         (keys.ceil() as usize).clamp(*AHEAD.start(), *AHEAD.end())
     }
 
+    /// Returns the number of keys that should be in flight or ready for copies: none while no copies are sent.
+    pub(super) fn ahead_of_copies(&self, now: Duration) -> usize {
+        if self.quick.get(now) < SOME { 0 } else { self.ahead(now) }
+    }
+
     pub(super) fn lead_time(&self) -> Duration {
         self.lead.map_or(FIRST_LEAD, Duration::from_secs_f64)
     }
@@ -106,9 +113,13 @@ impl Demand {
         self.steady.get(now)
     }
 
-    /// Returns a warning if it is due and the demand comes close to `supply`, the keys per second that the KME gives.
-    pub(super) fn warning(&mut self, now: Duration, supply: f64) -> Option<SupplyWarning> {
-        let demand = self.demand(now);
+    /// Returns a warning if it is due and the `demand` comes close to `supply`, the keys per second that the KME gives.
+    pub(super) fn warning(
+        &mut self,
+        now: Duration,
+        demand: f64,
+        supply: f64,
+    ) -> Option<SupplyWarning> {
         let due = self.warned.is_none_or(|at| now.saturating_sub(at) >= WARN_EVERY);
         if !due || demand <= CLOSE * supply {
             return None;
@@ -167,10 +178,13 @@ mod tests {
     fn it_warns_when_the_kme_gives_too_little() {
         let mut demand = Demand::new();
         let now = run(&mut demand, 0, 100);
-        assert!(demand.warning(now, 20.0).is_none(), "10 keys/s of 20");
-        let warning = demand.warning(now, 5.0).expect("10 keys/s of 5");
+        assert!(demand.warning(now, demand.demand(now), 20.0).is_none(), "10 keys/s of 20");
+        let warning = demand.warning(now, demand.demand(now), 5.0).expect("10 keys/s of 5");
         assert!(warning.supply == 5.0 && (5.0..10.5).contains(&warning.demand), "{warning}");
-        assert!(demand.warning(now, 5.0).is_none(), "said a moment ago");
-        assert!(demand.warning(now + ms(300_000), 5.0).is_none(), "demand has gone");
+        assert!(demand.warning(now, demand.demand(now), 5.0).is_none(), "said a moment ago");
+        assert!(
+            demand.warning(now + ms(300_000), demand.demand(now + ms(300_000)), 5.0).is_none(),
+            "demand has gone"
+        );
     }
 }

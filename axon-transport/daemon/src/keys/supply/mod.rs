@@ -5,6 +5,7 @@
 //! fetches the same keys. There is one pair for each peer SAE, and it outlives connections. The rules of
 //! [`etsi_qkd014::pool`] decide when to draw from the KME, and how many keys.
 
+mod connection_keys;
 mod demand;
 mod disagreement;
 mod pool;

@@ -1,19 +1,19 @@
 //! The sending direction: fetches keys ahead, announces them, and seals messages under keys that are READY.
+//!
+//! The messages leave over one connection. Copies of small messages may also leave over a connection that stands by, each
+//! under a key of that connection. Both draw from one stock of keys, and the messages come first.
 
-use std::{
-    collections::{HashMap, VecDeque},
-    sync::Arc,
-    time::Duration,
-};
+use std::{collections::VecDeque, time::Duration};
 
 use axon_envelope::{
-    Channel, ChannelError, Delivery, KEY_MAX_AGE, KeyId, KmeKey, MAX_HEADER_LEN, MESSAGES_PER_KEY,
-    Sealer, Slot, TAG_LEN,
+    Channel, ChannelError, Delivery, KeyId, KmeKey, MAX_HEADER_LEN, MESSAGES_PER_KEY, Retirement,
+    Slot, TAG_LEN,
 };
 use serde::Serialize;
 
 use super::{
     Disagreement, MAX_UNRETIRED, SupplyError, SupplyWarning,
+    connection_keys::{AnnouncedKey, ConnectionKeys, ReleasedKeys},
     demand::{self, Demand},
     disagreement::Disagreements,
     pool::{KeyStock, UnusedKey},
@@ -21,8 +21,6 @@ use super::{
 use crate::{
     keys::{
         Exporters, KeyMessage, KeyViolation,
-        exporters::Exporter,
-        proof,
         request::{Answer, KmeRequest},
     },
     wire::keys::MAX_ANNOUNCED,
@@ -36,31 +34,20 @@ const ANSWER_WITHIN: Duration = Duration::from_secs(60);
 pub struct KeySender {
     local: String,
     peer: String,
-    link: Option<SenderLink>,
+    /// The connection over which messages leave.
+    in_use: Option<ConnectionKeys>,
+    /// The connection that stands by, over which copies of messages leave.
+    standby: Option<ConnectionKeys>,
     /// Keys that are drawn or being drawn, and have to be announced.
     pool: KeyStock,
-    announced: HashMap<KeyId, Announced>,
-    /// READY keys, in the order of use. Only the first may have sealed messages.
-    ready: VecDeque<Sealer>,
-    /// The time at which the first key of `ready` was first handed out.
-    begun: Option<Duration>,
     outbox: VecDeque<(u64, KeyMessage)>,
     demand: Demand,
+    /// The demand of the copies.
+    copy_demand: Demand,
+    /// The numbers of keys ahead for messages, within the KME's stock, and for copies, as last planned.
+    share: (usize, usize),
     disagreements: Disagreements,
     counts: SenderCounts,
-}
-
-struct SenderLink {
-    conn: u64,
-    channel: Channel,
-    ready: Exporter,
-}
-
-struct Announced {
-    key: KmeKey,
-    asked: Option<Duration>,
-    /// The time of its first announcement, on any connection.
-    since: Duration,
 }
 
 #[derive(Default)]
@@ -139,13 +126,13 @@ impl KeySender {
         let mut sender = Self {
             local: local_sae.to_owned(),
             peer: peer_sae.to_owned(),
-            link: None,
+            in_use: None,
+            standby: None,
             pool: KeyStock::new(jitter),
-            announced: HashMap::new(),
-            ready: VecDeque::new(),
-            begun: None,
             outbox: VecDeque::new(),
             demand: Demand::new(),
+            copy_demand: Demand::new(),
+            share: (0, 0),
             disagreements: Disagreements::default(),
             counts: SenderCounts::default(),
         };
@@ -153,7 +140,8 @@ impl KeySender {
         Ok(sender)
     }
 
-    /// Moves to a new connection. Keys that sealed no message are announced again there; a key in use is retired.
+    /// Moves to a new connection. Keys that sealed no message are announced again there; a key in use is retired. If the
+    /// connection stood by, it keeps the keys that it has.
     /// Returns the RETIREs that are owed on the connection before, each with that connection. The caller sends them
     /// there, if that connection is open, and nowhere else.
     ///
@@ -165,26 +153,56 @@ impl KeySender {
         conn: u64,
         exporters: &Exporters,
     ) -> Result<Vec<(u64, KeyMessage)>, SupplyError> {
-        let channel = Channel::new(&self.local, &self.peer, exporters.envelope())?;
-        self.unbind(now);
-        let retire = |(_, m): &(u64, KeyMessage)| matches!(m, KeyMessage::Retire { .. });
-        let owed = self.outbox.drain(..).filter(retire).collect();
-        self.link = Some(SenderLink { conn, channel, ready: Arc::clone(exporters.ready()) });
-        Ok(owed)
+        let next = match self.standby.take_if(|standby| standby.connection() == conn) {
+            Some(standby) => standby,
+            None => ConnectionKeys::new(conn, (&self.local, &self.peer), exporters)?,
+        };
+        self.settle(now);
+        let before = self.in_use.replace(next);
+        let Some(mut before) = before else { return Ok(Vec::new()) };
+        let number = before.connection();
+        self.put_back(number, before.release());
+        let (owed, others) = self.outbox.drain(..).partition(|(of, _)| *of == number);
+        self.outbox = others;
+        Ok(Vec::from(owed))
+    }
+
+    /// Lets copies of messages leave over another connection, which stands by. Its keys are fetched once copies need them.
+    ///
+    /// # Errors
+    /// The SAE IDs do not make a channel.
+    pub fn attach_standby(
+        &mut self,
+        now: Duration,
+        conn: u64,
+        exporters: &Exporters,
+    ) -> Result<(), SupplyError> {
+        if self.attached() == Some(conn) {
+            return Ok(());
+        }
+        let next = ConnectionKeys::new(conn, (&self.local, &self.peer), exporters)?;
+        if let Some(before) = self.standby.as_ref().map(ConnectionKeys::connection) {
+            self.detach(now, before);
+        }
+        self.standby = Some(next);
+        Ok(())
     }
 
     /// Detaches a closed connection. Keys that sealed no message wait for the next connection.
     pub fn detach(&mut self, now: Duration, conn: u64) {
-        if self.link.as_ref().is_some_and(|link| link.conn == conn) {
-            self.unbind(now);
-            self.outbox.clear();
-            self.link = None;
+        self.settle(now);
+        let is_closed = |keys: &mut ConnectionKeys| keys.connection() == conn;
+        for mut closed in
+            [self.in_use.take_if(is_closed), self.standby.take_if(is_closed)].into_iter().flatten()
+        {
+            self.put_back(conn, closed.release());
         }
+        self.outbox.retain(|(of, _)| *of != conn);
     }
 
     /// Returns the connection that [`slot`](Self::slot) seals for. The sealed messages open on no other connection.
     pub fn attached(&self) -> Option<u64> {
-        self.link.as_ref().map(|link| link.conn)
+        self.in_use.as_ref().map(ConnectionKeys::connection)
     }
 
     /// Adds a key that the peer has proven to hold on `conn`, as READY. If `conn` is not attached, the key has to be
@@ -207,10 +225,8 @@ impl KeySender {
             self.failed(why);
             return Ok(());
         }
-        match &self.link {
-            Some(link) if link.conn == conn => {
-                self.ready.push_back(Sealer::new(&link.channel, key_id, key)?);
-            }
+        match &mut self.in_use {
+            Some(keys) if keys.connection() == conn => keys.add_ready(key_id, key)?,
             _ => self.pool.put(now, key_id, key),
         }
         Ok(())
@@ -219,6 +235,11 @@ impl KeySender {
     /// Counts `messages` more that are to be sent to this peer. Each message counts once, however often it is tried.
     pub fn demand(&mut self, now: Duration, messages: u32) {
         self.demand.messages(now, messages);
+    }
+
+    /// Counts `messages` more whose copies are to be sent over the connection that stands by.
+    pub fn demand_copies(&mut self, now: Duration, messages: u32) {
+        self.copy_demand.messages(now, messages);
     }
 
     /// Returns a permit to seal one message, at once and on the attached connection. Services seal as
@@ -233,28 +254,37 @@ impl KeySender {
             self.counts.no_key += 1;
             return Err(no_key);
         }
-        self.begun.get_or_insert(now);
-        let first = self.ready.front_mut().ok_or(NoKey::None)?;
-        first.slot(now, delivery).map_err(|_| NoKey::None)
+        self.in_use.as_mut().ok_or(NoKey::Detached)?.slot(now, delivery)
+    }
+
+    /// Returns a permit to seal one copy of a message, at once and on connection `conn`, which stands by. The peer waits for
+    /// no copy, so its delivery is that of BEST_EFFORT.
+    ///
+    /// # Errors
+    /// [`NoKey`].
+    pub fn copy_slot(&mut self, now: Duration, conn: u64) -> Result<Slot<'_>, NoKey> {
+        self.settle(now);
+        self.plan(now);
+        let standby = self.standby.as_mut().filter(|standby| standby.connection() == conn);
+        standby.ok_or(NoKey::Detached)?.slot(now, Delivery::BestEffort)
     }
 
     /// Returns the bytes that an envelope has in addition to its plaintext. It is an upper bound for the next
     /// [`slot`](Self::slot), because KMEs choose the names of keys.
     pub fn overhead(&self) -> usize {
-        self.ready.iter().map(Sealer::overhead).max().unwrap_or(MAX_HEADER_LEN + TAG_LEN)
+        self.in_use.as_ref().map_or(MAX_HEADER_LEN + TAG_LEN, ConnectionKeys::overhead)
     }
 
     /// Returns the number of messages that could be sealed now, with the reserved keys as last planned.
     pub fn available(&self, delivery: Delivery) -> u32 {
-        if self.allowed(delivery).is_err() {
+        let Some(keys) = self.in_use.as_ref().filter(|_| self.allowed(delivery).is_ok()) else {
             return 0;
-        }
-        let all: u32 = self.ready.iter().map(|s| u32::from(s.remaining())).sum();
+        };
         let kept = match delivery {
             Delivery::Reliable => 0,
             Delivery::BestEffort => self.reserve() as u32 * u32::from(MESSAGES_PER_KEY),
         };
-        all.saturating_sub(kept)
+        keys.remaining().saturating_sub(kept)
     }
 
     /// Handles READY or FAILED from the peer. A proof that does not match retires its key and nothing else: the peer's
@@ -269,31 +299,34 @@ impl KeySender {
         message: &KeyMessage,
     ) -> Result<(), SupplyError> {
         // A late message on an earlier connection concerns keys that were announced again.
-        let Some(link) = self.link.as_ref().filter(|link| link.conn == conn) else {
+        let both = [self.in_use.as_mut(), self.standby.as_mut()].into_iter().flatten();
+        let Some(keys) = both.into_iter().find(|keys| keys.connection() == conn) else {
             return Ok(());
         };
         match message {
             KeyMessage::Ready { key_id, proof } => {
-                let Some(waiting) = self.announced.get(key_id) else { return Ok(()) };
-                if !proof::verify(&waiting.key, key_id, &link.ready, proof) {
-                    self.give_up(now, key_id);
+                let Some(proven) = keys.proves(key_id, proof) else { return Ok(()) };
+                if !proven {
+                    self.give_up(now, conn, key_id);
                     self.counts.disagreed += 1;
                     self.disagreements.add(key_id.clone());
                     self.failed(format!("peer holds another key under key_ID {key_id}"));
                     return Ok(());
                 }
-                let Some(Announced { key, asked, .. }) = self.announced.remove(key_id) else {
+                let Some(AnnouncedKey { key, asked, .. }) = keys.take_announced(key_id) else {
                     return Ok(());
                 };
+                keys.add_ready(key_id.clone(), key)?;
                 self.pool.key_ready();
                 if let Some(asked) = asked {
-                    self.demand.ready(now.saturating_sub(asked));
+                    let lead = now.saturating_sub(asked);
+                    self.demand.ready(lead);
+                    self.copy_demand.ready(lead);
                 }
-                self.ready.push_back(Sealer::new(&link.channel, key_id.clone(), key)?);
                 Ok(())
             }
             KeyMessage::Failed { key_id, reason } => {
-                if let Some(refused) = self.announced.remove(key_id) {
+                if let Some(refused) = keys.take_announced(key_id) {
                     self.pool.key_refused(now, refused.since);
                     self.failed(format!("peer could not fetch key_ID {key_id}: {reason}"));
                 }
@@ -316,7 +349,7 @@ impl KeySender {
     pub fn poll_request(&mut self, now: Duration) -> Option<KmeRequest> {
         self.settle(now);
         self.plan(now);
-        self.link.as_ref()?;
+        self.in_use.as_ref()?;
         self.pool.poll(now, &self.peer)
     }
 
@@ -329,27 +362,31 @@ impl KeySender {
 
     /// Returns when to poll again without other cause.
     pub fn poll_timeout(&self) -> Option<Duration> {
-        let used = self.begun.map(|at| at + KEY_MAX_AGE);
-        let unanswered = self.announced.values().map(|a| a.since + ANSWER_WITHIN).min();
-        let calls = self.link.as_ref().and_then(|_| self.pool.poll_timeout());
-        [used, unanswered, calls].into_iter().flatten().min()
+        let of_connection = |keys: &ConnectionKeys| {
+            let unanswered = keys.unanswered_since().map(|since| since + ANSWER_WITHIN);
+            [keys.spent_at(), unanswered].into_iter().flatten().min()
+        };
+        let keys = self.connections().filter_map(of_connection).min();
+        let calls = self.in_use.as_ref().and_then(|_| self.pool.poll_timeout());
+        [keys, calls].into_iter().flatten().min()
     }
 
     /// Returns whether nothing can be sealed because this host's KME gives no keys. While the peer owes an answer for a
     /// key, the peer is the cause instead.
     pub fn lacks_keys_of_kme(&self) -> bool {
-        self.ready.is_empty() && self.announced.is_empty() && self.pool.fails()
+        let has_none = |keys: &ConnectionKeys| keys.ready() == 0 && keys.announced() == 0;
+        self.in_use.as_ref().is_none_or(has_none) && self.pool.fails()
     }
 
     /// Returns the statistics.
     pub fn statistics(&self, now: Duration) -> SenderStatistics {
         let pool = self.pool.status(now);
         SenderStatistics {
-            ready: self.ready.len(),
-            announced: self.announced.len(),
+            ready: self.connections().map(ConnectionKeys::ready).sum(),
+            announced: self.connections().map(ConnectionKeys::announced).sum(),
             asked: pool.asked,
             target: pool.target,
-            demand: self.demand.demand(now),
+            demand: self.keys_needed(now),
             supply: pool.supply,
             lead_ms: self.demand.lead_time().as_secs_f64() * 1e3,
             sealed: self.counts.sealed,
@@ -364,7 +401,8 @@ impl KeySender {
     /// Returns a warning if the demand comes close to the supply; at most every ten seconds.
     pub fn warning(&mut self, now: Duration) -> Option<SupplyWarning> {
         let supply = self.pool.status(now).supply?;
-        self.demand.warning(now, supply)
+        let needed = self.keys_needed(now);
+        self.demand.warning(now, needed, supply)
     }
 
     /// Returns a report of keys that the peer holds with other bytes; at most every ten seconds.
@@ -372,79 +410,93 @@ impl KeySender {
         self.disagreements.take(now)
     }
 
+    /// Returns the keys per second that messages and copies need.
+    fn keys_needed(&self, now: Duration) -> f64 {
+        self.demand.demand(now) + self.copy_demand.demand(now)
+    }
+
+    fn connections(&self) -> impl Iterator<Item = &ConnectionKeys> {
+        self.in_use.iter().chain(&self.standby)
+    }
+
     /// Reports to the pool the number of keys to hold ahead, and the number of them that left it.
     fn plan(&mut self, now: Duration) {
-        let elsewhere = self.announced.len() + self.unbegun();
-        self.pool.plan(self.demand.ahead(now), elsewhere);
+        let messages = self.demand.ahead(now);
+        let copies = self.standby.as_ref().map_or(0, |_| self.copy_demand.ahead_of_copies(now));
+        let ahead = |keys: &Option<ConnectionKeys>| keys.as_ref().map_or(0, ConnectionKeys::ahead);
+        // Surplus keys of one connection do not serve the other one.
+        let elsewhere = ahead(&self.in_use).min(messages) + ahead(&self.standby).min(copies);
+        self.pool.plan(messages + copies, elsewhere);
+        self.share = (messages.min(self.pool.target()), copies);
     }
 
     /// Returns the number of READY keys that are reserved for RELIABLE and services, as last planned.
     fn reserve(&self) -> usize {
-        demand::reserve(self.pool.target())
+        demand::reserve(self.share.0)
     }
 
     fn allowed(&self, delivery: Delivery) -> Result<(), NoKey> {
-        if self.link.is_none() {
-            return Err(NoKey::Detached);
-        }
-        match (self.ready.len(), delivery) {
+        let Some(keys) = &self.in_use else { return Err(NoKey::Detached) };
+        match (keys.ready(), delivery) {
             (0, _) => Err(NoKey::None),
             (n, Delivery::BestEffort) if n <= self.reserve() => Err(NoKey::Reserved),
             _ => Ok(()),
         }
     }
 
-    /// Retires the key in use once it is finished.
+    /// Retires the keys in use that are finished.
     fn settle(&mut self, now: Duration) {
-        while let Some(first) = self.ready.front() {
-            let old = self.begun.is_some_and(|at| now.saturating_sub(at) >= KEY_MAX_AGE);
-            if !old && first.spent(now).is_none() {
-                break;
-            }
-            self.retire_first();
+        while let Some((conn, retired)) = self.poll_spent(now) {
+            self.retire(conn, retired);
         }
     }
 
+    fn poll_spent(&mut self, now: Duration) -> Option<(u64, Retirement)> {
+        let both = [self.in_use.as_mut(), self.standby.as_mut()].into_iter().flatten();
+        let mut spent = both.filter_map(|keys| Some((keys.connection(), keys.retire_spent(now)?)));
+        spent.next()
+    }
+
     fn drop_unanswered(&mut self, now: Duration) {
-        let late = |a: &Announced| now.saturating_sub(a.since) >= ANSWER_WITHIN;
-        let late: Vec<KeyId> =
-            self.announced.iter().filter(|(_, a)| late(a)).map(|(id, _)| id.clone()).collect();
-        for key_id in late {
-            self.give_up(now, &key_id);
+        let since = now.checked_sub(ANSWER_WITHIN);
+        let late: Vec<(u64, KeyId)> = self
+            .connections()
+            .flat_map(|keys| keys.unanswered(since).into_iter().map(|id| (keys.connection(), id)))
+            .collect();
+        for (conn, key_id) in late {
+            self.give_up(now, conn, &key_id);
             self.failed(format!("peer did not answer ANNOUNCE of key_ID {key_id}"));
         }
     }
 
     /// Erases an announced key that will seal no message, and asks the peer to erase its own.
-    fn give_up(&mut self, now: Duration, key_id: &KeyId) {
-        if let Some(refused) = self.announced.remove(key_id) {
-            self.pool.key_refused(now, refused.since);
+    fn give_up(&mut self, now: Duration, conn: u64, key_id: &KeyId) {
+        let both = [self.in_use.as_mut(), self.standby.as_mut()].into_iter().flatten();
+        for keys in both.filter(|keys| keys.connection() == conn) {
+            if let Some(refused) = keys.take_announced(key_id) {
+                self.pool.key_refused(now, refused.since);
+            }
         }
         let (used, reliable) = Default::default();
-        self.tell(KeyMessage::Retire { key_id: key_id.clone(), used, reliable });
+        let retire = KeyMessage::Retire { key_id: key_id.clone(), used, reliable };
+        self.outbox.push_back((conn, retire));
     }
 
-    fn retire_first(&mut self) {
-        self.begun = None;
-        let Some(sealer) = self.ready.pop_front() else { return };
-        let retirement = sealer.retire();
+    fn retire(&mut self, conn: u64, retirement: Retirement) {
         self.counts.retired += 1;
         self.counts.sealed += retirement.used.len() as u64;
         let (key_id, used) = (retirement.key_id, retirement.used);
-        self.tell(KeyMessage::Retire { key_id, used, reliable: retirement.reliable });
+        let retire = KeyMessage::Retire { key_id, used, reliable: retirement.reliable };
+        self.outbox.push_back((conn, retire));
     }
 
-    fn tell(&mut self, message: KeyMessage) {
-        if let Some(link) = &self.link {
-            self.outbox.push_back((link.conn, message));
-        }
-    }
-
+    /// Announces keys of the pool.
     fn announce(&mut self, now: Duration) -> Option<(u64, KeyMessage)> {
-        let conn = self.link.as_ref()?.conn;
-        let room = MAX_UNRETIRED.saturating_sub(self.announced.len() + self.ready.len());
-        let mut key_ids = Vec::new();
-        while key_ids.len() < MAX_ANNOUNCED.min(room)
+        let held: usize = self.connections().map(|keys| keys.ready() + keys.announced()).sum();
+        let room = MAX_UNRETIRED.saturating_sub(held).min(MAX_ANNOUNCED);
+        let (mut key_ids, mut of_copies) = (Vec::new(), Vec::new());
+        while key_ids.len() + of_copies.len() < room
+            && let Some(in_use) = &mut self.in_use
             && let Some(UnusedKey { key_id, key, asked, announced }) = self.pool.take(now)
         {
             let since = announced.unwrap_or(now);
@@ -453,38 +505,53 @@ impl KeySender {
                 self.failed(format!("peer did not answer ANNOUNCE of key_ID {key_id}"));
                 continue;
             }
-            key_ids.push(key_id.clone());
-            self.announced.insert(key_id, Announced { key, asked, since });
-        }
-        (!key_ids.is_empty()).then_some((conn, KeyMessage::Announce(key_ids)))
-    }
-
-    /// Removes all keys from the connection: the key in use is retired, and the others become fresh again.
-    fn unbind(&mut self, now: Duration) {
-        self.settle(now);
-        while let Some(sealer) = self.ready.pop_front() {
-            match sealer.into_unused() {
-                Ok((key_id, key)) => self.pool.put_back(key_id, key, None),
-                Err(begun) => {
-                    self.ready.push_front(begun);
-                    self.retire_first();
+            // The peer may hold an earlier key for a connection that was in use, from which it moves none to one that stands
+            // by. Keys from the KME have the time of their request.
+            let is_new = asked.is_some();
+            let (messages, copies) = self.share;
+            let standby = self
+                .standby
+                .as_mut()
+                .filter(|standby| is_new && in_use.ahead() >= messages && standby.ahead() < copies);
+            let announced = AnnouncedKey { key, asked, since };
+            match standby {
+                Some(standby) => {
+                    of_copies.push(key_id.clone());
+                    standby.announce(key_id, announced);
+                }
+                None => {
+                    key_ids.push(key_id.clone());
+                    in_use.announce(key_id, announced);
                 }
             }
         }
-        self.begun = None;
-        for (key_id, Announced { key, since, .. }) in self.announced.drain() {
+        let announce = |keys: &Option<ConnectionKeys>, key_ids: Vec<KeyId>| {
+            let conn = keys.as_ref().filter(|_| !key_ids.is_empty())?.connection();
+            Some((conn, KeyMessage::Announce(key_ids)))
+        };
+        self.outbox.extend(announce(&self.in_use, key_ids));
+        self.outbox.extend(announce(&self.standby, of_copies));
+        self.outbox.pop_front()
+    }
+
+    /// Takes back the keys of a connection that is not used any more: the key in use is retired, and the others become
+    /// fresh again.
+    fn put_back(&mut self, conn: u64, released: ReleasedKeys) {
+        if let Some(retired) = released.retired {
+            self.retire(conn, retired);
+        }
+        for (key_id, key) in released.unused {
+            self.pool.put_back(key_id, key, None);
+        }
+        for (key_id, AnnouncedKey { key, since, .. }) in released.announced {
             self.pool.put_back(key_id, key, Some(since));
         }
     }
 
-    /// Returns the number of READY keys that sealed no message.
-    fn unbegun(&self) -> usize {
-        self.ready.len() - usize::from(self.begun.is_some() && !self.ready.is_empty())
-    }
-
     fn unretired(&self, now: Duration) -> usize {
         let pool = self.pool.status(now);
-        pool.held + pool.asked + self.announced.len() + self.ready.len()
+        let held: usize = self.connections().map(|keys| keys.ready() + keys.announced()).sum();
+        pool.held + pool.asked + held
     }
 
     fn failed(&mut self, why: String) {

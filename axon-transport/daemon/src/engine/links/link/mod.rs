@@ -146,10 +146,9 @@ impl Link {
         matches!(self.phase, LinkPhase::Open | LinkPhase::Leaving(_))
     }
 
-    /// Returns whether it stands by, and may carry copies of samples. They have no envelopes of their own.
+    /// Returns whether it stands by, and carries copies of samples alone.
     pub(super) fn carries_copies(&self) -> bool {
-        let seals = self.peer.as_ref().is_none_or(|peer| peer.seals);
-        matches!(self.phase, LinkPhase::Standby) && !seals
+        matches!(self.phase, LinkPhase::Standby)
     }
 
     /// Returns whether it carries samples.

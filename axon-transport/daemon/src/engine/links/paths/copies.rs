@@ -14,19 +14,18 @@ use crate::engine::{
 };
 
 impl Links {
-    /// Returns an empty batch with room for the copies that the second path to a peer takes now. A link whose messages
-    /// have envelopes of their own takes none.
+    /// Returns an empty batch with room for the copies that the second path to a peer takes now.
     pub(in crate::engine) fn copy_batch(&self, daemon: DaemonId, now: Duration) -> CopyBatch {
-        let number = self.table.standby(daemon);
-        let standby = number.and_then(|number| {
-            let seals = self.table.peer(number)?.seals;
-            self.connections.get(number).filter(|_| !seals)
-        });
-        let room = standby.map_or(0, |standby| {
-            let since = standby.watch.as_ref().and_then(AnswerWatch::since);
-            standby.copies.room(&standby.quic, since, now)
-        });
-        CopyBatch { room, copies: Vec::new() }
+        let Some((connection, standby)) = self
+            .table
+            .standby(daemon)
+            .and_then(|number| Some((number, self.connections.get(number)?)))
+        else {
+            return CopyBatch::default();
+        };
+        let since = standby.watch.as_ref().and_then(AnswerWatch::since);
+        let room = standby.copies.room(&standby.quic, since, now);
+        CopyBatch { connection, room, copies: Vec::new() }
     }
 
     /// Sends copies over the second path to a peer.

@@ -35,7 +35,7 @@ use super::{
 use crate::{
     engine::{
         congestion::let_probe_through,
-        link::target::DialTarget,
+        link::{opening::Sealing, target::DialTarget},
         links::LinkEvent,
         quic::{
             answers::{AnswerWatch, Exchange},
@@ -131,6 +131,12 @@ impl Links {
             // The link in use changed meanwhile, or messages on two connections overtook each other.
             self.end_standby(number, "the link beside it changed", now);
             return self.opening_failed(number);
+        }
+        let sealing = self.table.peer(number).and_then(|peer| peer.sealing.as_ref());
+        if let (Some(keyring), Some(Sealing { exporters, .. })) = (&mut self.keyring, sealing)
+            && let Err(error) = keyring.attach_standby(now, number, exporters)
+        {
+            tracing::error!(peer = %daemon, %error, "no message keys for the second link");
         }
         let max_age = self.keyring.as_ref().map(|keyring| keyring.config.session_max_age);
         let Some(link) = self.table.get_mut(number) else { return };

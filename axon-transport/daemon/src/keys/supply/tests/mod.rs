@@ -4,6 +4,7 @@ mod any_order;
 mod drawing;
 mod receiving;
 mod sending;
+mod standby;
 
 use std::{collections::HashMap, time::Duration};
 
@@ -89,6 +90,8 @@ struct Pair {
     sender: KeySender,
     receiver: KeyReceiver,
     conn: u64,
+    /// The connection that stands by.
+    standby: Option<u64>,
     /// The messages in both directions.
     log: Vec<KeyMessage>,
 }
@@ -110,6 +113,7 @@ impl Pair {
             sender: KeySender::with_jitter("sae-a", "sae-b", || 255).unwrap(),
             receiver: KeyReceiver::new("sae-b", "sae-a").unwrap(),
             conn: 0,
+            standby: None,
             log: Vec::new(),
         };
         pair.connect();
@@ -155,7 +159,7 @@ impl Pair {
                 let answer = self.kmes.answer(request);
                 self.receiver.handle_answer(self.now, answer);
             } else if let Some((conn, message)) = self.sender.poll_message(self.now) {
-                if conn == self.conn {
+                if conn == self.conn || Some(conn) == self.standby {
                     self.receiver.handle_message(self.now, conn, &message).unwrap();
                 }
                 self.log.push(message);

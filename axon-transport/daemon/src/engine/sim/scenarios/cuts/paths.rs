@@ -52,6 +52,26 @@ fn with_paths(
     }
 }
 
+/// Returns settings with two paths, both of which small samples cross, if that is `redundant`; `None`: without a rule.
+fn with_rule(
+    config: impl Fn(usize) -> Config,
+    redundant: Option<bool>,
+) -> impl Fn(usize) -> Config {
+    with_paths(
+        move |host| {
+            let mut config = config(host);
+            let rule = TopicRule::new(TopicPattern::new("/*").unwrap(), TopicPriority::Normal);
+            config.topics = vec![match redundant {
+                Some(true) => rule.over_both_paths(),
+                Some(false) => rule.over_one_path(),
+                None => rule,
+            }];
+            config
+        },
+        |_| 2,
+    )
+}
+
 /// Returns settings whose links are renewed after ten seconds.
 fn short_lived(mode: KeyMode) -> impl Fn(usize) -> Config {
     move |host| {
@@ -185,8 +205,11 @@ fn traffic_moves_to_the_second_path_when_the_first_is_cut() {
 
 #[test]
 fn paths_that_are_cut_in_turn_at_random_lose_nothing() {
-    for (number, (mode, config)) in (0..).zip(modes()) {
-        let mut paths = TwoPaths::new(61, &config);
+    let cases = [None, Some(true)]
+        .into_iter()
+        .flat_map(|copied| modes().into_iter().map(move |mode| (copied, mode)));
+    for (number, (copied, (mode, config))) in (0..).zip(cases) {
+        let mut paths = TwoPaths::with(61, with_rule(&config, copied));
         let mut random = stream(61 + number, Stream::Script);
         let mut longest = Duration::ZERO;
         for _ in 0..20 {
@@ -198,10 +221,11 @@ fn paths_that_are_cut_in_turn_at_random_lose_nothing() {
         }
         let [p50, p99, p999] = [0.5, 0.99, 0.999].map(|share| paths.age_of(share));
         println!(
-            "{mode}: nothing arrived for {longest:?} at most; ages p50 {p50} ms, p99 {p99} ms, p99.9 {p999} ms"
+            "{mode}, redundant {copied:?}: nothing arrived for {longest:?} at most; ages p50 {p50} ms, p99 {p99} ms, \
+             p99.9 {p999} ms"
         );
         assert!(longest <= SWITCHED, "{mode}: nothing arrived for {longest:?}");
-        if mode != "messages10" {
+        if mode != "messages10" || copied == Some(true) {
             // No sample waits for a take-over: it crosses both paths.
             assert!(p99 < 30, "{mode}: {p99} ms");
         }
@@ -218,22 +242,15 @@ fn copies(paths: &TwoPaths) -> (u64, u64) {
 }
 
 #[test]
-fn small_samples_cross_both_paths_unless_they_have_envelopes_or_a_rule() {
+fn small_samples_cross_both_paths_by_default_or_by_a_rule() {
     for (mode, config) in modes() {
-        for redundant in [true, false] {
-            let config = with_paths(&config, |_| 2);
-            let mut paths = TwoPaths::with(72, |host| {
-                let mut config = config(host);
-                let name = TopicPattern::new("/*").unwrap();
-                let rule = TopicRule::new(name, TopicPriority::Normal);
-                config.topics = vec![if redundant { rule } else { rule.over_one_path() }];
-                config
-            });
+        for redundant in [None, Some(true), Some(false)] {
+            let mut paths = TwoPaths::with(72, with_rule(&config, redundant));
             paths.publish(secs(3));
             let (sent, _) = copies(&paths);
-            let expected = redundant && mode != "messages10";
-            assert_eq!(sent > 200, expected, "{mode}, {redundant}: {sent}");
-            assert!(sent > 200 || sent == 0, "{mode}, {redundant}: {sent}");
+            let expected = redundant.unwrap_or(mode != "messages10");
+            assert_eq!(sent > 200, expected, "{mode}, {redundant:?}: {sent}");
+            assert!(sent > 200 || sent == 0, "{mode}, {redundant:?}: {sent}");
             // The link in use loses half of its packets: copies come first.
             let bad = Path { loss: 0.5, delay: millis(2), ..Path::default() };
             let ends = [0, 1].map(|host| paths.world.hosts[host].address);
@@ -242,7 +259,7 @@ fn small_samples_cross_both_paths_unless_they_have_envelopes_or_a_rule() {
             }
             paths.publish(secs(3));
             let (_, first) = copies(&paths);
-            assert_eq!(first > 50, expected, "{mode}, {redundant}: {first}");
+            assert_eq!(first > 50, expected, "{mode}, {redundant:?}: {first}");
             paths.is_complete(mode);
         }
     }
