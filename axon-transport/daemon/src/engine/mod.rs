@@ -432,7 +432,7 @@ impl Engine {
                 if let Some(mut carrier) = self.links.carrier(peer.link, now) {
                     carrier.copies = batch;
                     peer.outbound.pump(&mut carrier, now);
-                    let copies = carrier.copies.copies;
+                    let copies = carrier.copies.take();
                     self.links.touch(peer.link);
                     self.links.send_copies(daemon, copies, now);
                 }

@@ -265,10 +265,15 @@ impl Inbound {
             stream.step = StreamStep::Writer(message, now + ARRIVAL);
             return Ok(StepOutcome::Go);
         }
-        let Some((opened, payload)) = open_body(open, body, route, now).map_err(refused)? else {
-            if header.copy {
+        let opened = match open_body(open, body, route, now) {
+            // A copy may come after its key was retired. Its sample comes over the link in use.
+            Ok(None) | Err(RefusedMessage::Envelope { .. }) if header.copy => {
+                self.release(stream);
                 return Ok(StepOutcome::Over);
             }
+            opened => opened.map_err(refused)?,
+        };
+        let Some((opened, payload)) = opened else {
             self.lost("no_link", header, ENDED, now);
             self.release(stream);
             return Ok(StepOutcome::Go);

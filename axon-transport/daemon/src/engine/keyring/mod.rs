@@ -224,6 +224,14 @@ impl Keyring {
         self.peers[number].sender.attach_standby(now, connection, exporters)
     }
 
+    /// Ends the use of a connection that stood by and was superseded: no copies leave over it any more.
+    pub(crate) fn release_standby(&mut self, now: Duration, connection: u64) {
+        if let Ok(number) = self.attached(connection) {
+            self.peers[number].sender.release_standby(now, connection);
+            self.touch(number);
+        }
+    }
+
     /// Forgets a connection that ended, or that failed before it became a link.
     pub(crate) fn forget_connection(&mut self, now: Duration, connection: u64) {
         let Some(number) = self.connections.remove(&connection) else { return };

@@ -251,6 +251,9 @@ impl Links {
                 // Nothing is sent over a superseded link, so it needs no keys.
                 peer.sealing = None;
             }
+            if let Some(keyring) = &mut self.keyring {
+                keyring.release_standby(now, number);
+            }
             self.hand_over(number, now);
             let opened = StreamEvent::Opened { dir: Dir::Uni };
             self.outbox.event(LinkEvent::Stream(number, daemon, opened));

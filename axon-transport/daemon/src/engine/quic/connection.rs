@@ -307,10 +307,13 @@ impl Carrier<'_> {
         after: u64,
         now: Duration,
     ) {
+        if !self.copies.takes(&header, sample.payload.len()) {
+            return;
+        }
         let mut frames = Frames::default();
         if self.seal.write_copy(sample, route, self.copies.connection, &mut frames, now).is_ok() {
             let frames = frames.take();
-            self.copies.copies.push(SampleCopy { header, after, frames });
+            self.copies.add(SampleCopy { header, after, frames });
         }
     }
 

@@ -4,17 +4,28 @@
 //! the second path, and the peer delivers whichever arrives first. A copy is a help and no promise: it is left out while
 //! the second path is silent or has many copies in flight.
 
-use std::time::Duration;
+use std::{collections::HashMap, mem, time::Duration};
 
 use axon_shm::ids::Gid;
 use bytes::Bytes;
 use quinn_proto::{Connection, Dir, StreamId, VarInt};
 
-use crate::{engine::sample::stream_header::StreamHeader, link::CloseCode};
+use crate::{
+    engine::{
+        rank::SMALL,
+        sample::{
+            protection::MAX_OVERHEAD,
+            stream_header::{HEADER, StreamHeader},
+        },
+    },
+    link::CloseCode,
+};
 
 /// Maximum number of copies in flight. Before a link is elected its peer allows 128 streams at a time, which are also for
 /// those that the election precedes.
 const MOST: usize = 96;
+/// Bytes of the start of a copy's stream, and of the header and envelope of its message, at most.
+const MAX_START: usize = HEADER + size_of::<u64>() + size_of::<u32>() + MAX_OVERHEAD;
 /// Maximum number of copies in flight of one flow, so that a fast flow leaves some to the others.
 const MOST_OF_FLOW: usize = 32;
 /// Time without an answer, and number of round trips, after which the second path counts as silent.
@@ -46,15 +57,37 @@ pub(in crate::engine) struct SampleCopy {
 pub(in crate::engine) struct CopyBatch {
     /// The connection that stands by.
     pub(in crate::engine) connection: u64,
-    /// Number of copies that the second path takes.
-    pub(in crate::engine) room: usize,
-    pub(in crate::engine) copies: Vec<SampleCopy>,
+    /// Number of copies, and of their bytes, that the second path takes.
+    room: (usize, usize),
+    /// Number of copies in flight by flow.
+    of_flow: HashMap<(u32, Gid), usize>,
+    copies: Vec<SampleCopy>,
 }
 
 impl CopyBatch {
     /// Returns whether the second path takes one more copy.
     pub(in crate::engine) fn has_room(&self) -> bool {
-        self.copies.len() < self.room
+        self.copies.len() < self.room.0
+    }
+
+    /// Returns whether the second path takes a copy of a payload of this length. A copy is sealed only then: its key would
+    /// be used up for nothing.
+    pub(in crate::engine) fn takes(&self, header: &StreamHeader, payload: usize) -> bool {
+        let of_flow = self.of_flow.get(&(header.route, header.of)).copied().unwrap_or(0);
+        self.has_room() && of_flow < MOST_OF_FLOW && payload + MAX_START <= self.room.1
+    }
+
+    /// Adds a copy.
+    pub(in crate::engine) fn add(&mut self, copy: SampleCopy) {
+        let bytes = MAX_START + copy.frames.iter().map(Bytes::len).sum::<usize>();
+        self.room.1 = self.room.1.saturating_sub(bytes);
+        *self.of_flow.entry((copy.header.route, copy.header.of)).or_default() += 1;
+        self.copies.push(copy);
+    }
+
+    /// Takes the copies.
+    pub(in crate::engine) fn take(&mut self) -> Vec<SampleCopy> {
+        mem::take(&mut self.copies)
     }
 }
 
@@ -80,19 +113,32 @@ pub(in crate::engine) struct CopyStreams {
 }
 
 impl CopyStreams {
-    /// Returns the number of copies that may leave now. `since`: since when the peer has not answered over this
-    /// connection.
-    pub(in crate::engine) fn room(
+    /// Returns an empty batch for the copies that may leave now over `connection`, which is this one. `since`: since when
+    /// the peer has not answered over it.
+    pub(in crate::engine) fn batch(
         &self,
+        connection: u64,
         quic: &Connection,
         since: Option<Duration>,
         now: Duration,
-    ) -> usize {
-        let is_full = !self.in_flight.is_empty() && self.bytes >= most_bytes(quic);
-        if is_full || is_silent(since, quic.rtt(), now) { 0 } else { MOST - self.in_flight.len() }
+    ) -> CopyBatch {
+        let mut batch = CopyBatch { connection, ..CopyBatch::default() };
+        if is_silent(since, quic.rtt(), now) {
+            return batch;
+        }
+        // One copy may always be in flight.
+        let bytes = match self.in_flight.is_empty() {
+            true => most_bytes(quic).max(MAX_START + SMALL),
+            false => most_bytes(quic).saturating_sub(self.bytes),
+        };
+        batch.room = (MOST.saturating_sub(self.in_flight.len()), bytes);
+        for copy in &self.in_flight {
+            *batch.of_flow.entry(copy.of).or_default() += 1;
+        }
+        batch
     }
 
-    /// Sends a copy in a stream of its own.
+    /// Sends a copy that the [batch](Self::batch) took, in a stream of its own.
     pub(in crate::engine) fn send(
         &mut self,
         quic: &mut Connection,
@@ -100,16 +146,11 @@ impl CopyStreams {
         now: Duration,
     ) {
         let of = (copy.header.route, copy.header.of);
-        let of_flow = self.in_flight.iter().filter(|sent| sent.of == of).count();
         let mut start = copy.header.encode().to_vec();
         start.extend_from_slice(&copy.after.to_be_bytes());
         let mut chunks = vec![Bytes::from(start)];
         chunks.append(&mut copy.frames);
         let bytes = chunks.iter().map(Bytes::len).sum();
-        let fits = self.in_flight.is_empty() || self.bytes + bytes <= most_bytes(quic);
-        if !fits || self.in_flight.len() >= MOST || of_flow >= MOST_OF_FLOW {
-            return;
-        }
         let Some(stream) = quic.streams().open(Dir::Uni) else { return };
         let written = quic.send_stream(stream).write_chunks(&mut chunks).map(|taken| taken.bytes);
         if written != Ok(bytes) {

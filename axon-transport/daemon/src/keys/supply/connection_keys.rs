@@ -157,6 +157,17 @@ impl ConnectionKeys {
         self.ready.pop_front().map(Sealer::retire)
     }
 
+    /// Takes all keys from the connection that sealed no message.
+    pub(super) fn release_unused(&mut self) -> ReleasedKeys {
+        let in_use = self.begun.and_then(|begun| Some((begun, self.ready.pop_front()?)));
+        let released = self.release();
+        if let Some((begun, key)) = in_use {
+            self.begun = Some(begun);
+            self.ready.push_back(key);
+        }
+        released
+    }
+
     /// Takes all keys from the connection.
     pub(super) fn release(&mut self) -> ReleasedKeys {
         let (mut retired, mut unused) = (None, Vec::new());
@@ -164,7 +175,10 @@ impl ConnectionKeys {
             match sealer.into_unused() {
                 Ok(key) => unused.push(key),
                 // Only the first key seals.
-                Err(begun) => retired = Some(begun.retire()),
+                Err(begun) => {
+                    debug_assert!(retired.is_none(), "one key seals at a time");
+                    retired = Some(begun.retire());
+                }
             }
         }
         self.begun = None;

@@ -65,16 +65,16 @@ impl KeyStock {
         Self { core, seen, rounds: 0, refused: None, readied: 0, fails: false }
     }
 
-    /// Sets the number of keys in flight or ready to `ahead`. The sender has `elsewhere` of them.
-    pub(super) fn plan(&mut self, ahead: usize, elsewhere: usize) {
+    /// Sets the number of keys in flight or ready to `ahead`. Returns how many of them the KME's stock allows, at least 1.
+    pub(super) fn set_ahead(&mut self, ahead: usize) -> usize {
         let few = self.rounds >= ROUNDS_OF_MANY;
         self.core.set_target(if few { ahead.min(FEW_KEYS) } else { ahead });
-        self.core.set_elsewhere(elsewhere);
+        self.core.target()
     }
 
-    /// Returns the planned number of keys, within the KME's stock. At least 1.
-    pub(super) fn target(&self) -> usize {
-        self.core.target()
+    /// Sets how many of the keys ahead the sender has.
+    pub(super) fn set_elsewhere(&mut self, elsewhere: usize) {
+        self.core.set_elsewhere(elsewhere);
     }
 
     /// Returns the next call, if any.

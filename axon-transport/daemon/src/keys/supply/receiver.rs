@@ -30,8 +30,9 @@ pub struct KeyReceiver {
     links: HashMap<u64, ReceiverLink>,
     /// The number of connections that were elected so far.
     elected: u64,
-    /// Keys that are being fetched, each with the connection that last announced it. The answer goes there.
-    wanted: HashMap<KeyId, u64>,
+    /// Keys that are being fetched, each with the connection that last announced it. The answer goes there. `None`: the key
+    /// was retired meanwhile, and counts until its fetch ends.
+    wanted: HashMap<KeyId, Option<u64>>,
     fetches: Fetches,
     /// Unused keys of closed connections.
     kept: VecDeque<(Duration, KeyId, KmeKey)>,
@@ -173,7 +174,9 @@ impl KeyReceiver {
                     .retire(now, key_id.as_bytes(), *used, *reliable)
                     .map_err(|e| KeyViolation::Masks(key_id.clone(), e.to_string()))?;
                 self.counts.retired += 1;
-                self.wanted.remove(key_id);
+                if let Some(wanted) = self.wanted.get_mut(key_id) {
+                    *wanted = None;
+                }
                 self.kept.retain(|(_, id, _)| id != key_id);
                 Ok(())
             }
@@ -195,7 +198,7 @@ impl KeyReceiver {
     pub fn handle_answer(&mut self, now: Duration, answer: Answer) {
         for (key_id, outcome) in self.fetches.handle_answer(now, answer) {
             // The key was retired meanwhile: no connection waits for it.
-            let Some(conn) = self.wanted.remove(&key_id) else { continue };
+            let Some(conn) = self.wanted.remove(&key_id).flatten() else { continue };
             match outcome {
                 Ok(key) if self.links.contains_key(&conn) => self.add(conn, key_id, key),
                 Ok(key) => self.keep(now, key_id, key),
@@ -232,12 +235,19 @@ impl KeyReceiver {
 
     /// Handles one announced key_ID. Returns true if the key has to be fetched.
     fn announced(&mut self, conn: u64, key_id: &KeyId) -> bool {
-        if self.links.get(&conn).is_some_and(|l| l.opener.contains(key_id.as_bytes())) {
-            self.fail(conn, key_id.clone(), "announced twice".to_owned());
+        if let Some(link) = self.links.get_mut(&conn)
+            && link.opener.contains(key_id.as_bytes())
+        {
+            // The sender moved the key to another connection, whose announcement did not arrive, and back.
+            match link.opener.take_unused(key_id.as_bytes()) {
+                Some((key_id, key)) => self.add(conn, key_id, key),
+                None => self.fail(conn, key_id.clone(), "announced after its use".to_owned()),
+            }
             return false;
         }
         let order = |conn: &u64| self.links.get(conn).map_or(0, |link| link.order);
-        let (this, waiting) = (order(&conn), self.wanted.get(key_id).map(order));
+        let (this, waiting) =
+            (order(&conn), self.wanted.get(key_id).and_then(|conn| conn.as_ref().map(order)));
         let holds = |link: &&ReceiverLink| link.opener.contains(key_id.as_bytes());
         let held = self.links.values().find(holds).map(|link| link.order);
         // The sender announced the key on a later connection meanwhile, and seals for that one.
@@ -249,15 +259,15 @@ impl KeyReceiver {
             return false;
         }
         if let Some(waiting) = self.wanted.get_mut(key_id) {
-            *waiting = conn;
+            *waiting = Some(conn);
             return false;
         }
-        let held = self.links.get(&conn).map_or(0, |l| l.opener.key_count());
+        let held: usize = self.links.values().map(|link| link.opener.key_count()).sum();
         if held + self.wanted.len() >= MAX_UNRETIRED {
             self.fail(conn, key_id.clone(), format!("{MAX_UNRETIRED} keys are not retired"));
             return false;
         }
-        self.wanted.insert(key_id.clone(), conn);
+        self.wanted.insert(key_id.clone(), Some(conn));
         true
     }
 

@@ -29,6 +29,8 @@ use crate::{
 /// The longest wait for READY or FAILED of an announced key, over all connections that it is announced on. It is longer
 /// than the receiver's attempts.
 const ANSWER_WITHIN: Duration = Duration::from_secs(60);
+/// The longest wait for the answer for a key of copies, after which their connection counts as silent.
+const COPY_ANSWER_WITHIN: Duration = Duration::from_secs(10);
 
 /// The keys of this host's messages to one peer.
 pub struct KeySender {
@@ -188,6 +190,14 @@ impl KeySender {
         Ok(())
     }
 
+    /// Ends the use of a connection that stood by, which was superseded and is not closed yet.
+    pub fn release_standby(&mut self, now: Duration, conn: u64) {
+        self.settle(now);
+        if let Some(mut standby) = self.standby.take_if(|standby| standby.connection() == conn) {
+            self.put_back(conn, standby.release());
+        }
+    }
+
     /// Detaches a closed connection. Keys that sealed no message wait for the next connection.
     pub fn detach(&mut self, now: Duration, conn: u64) {
         self.settle(now);
@@ -339,6 +349,7 @@ impl KeySender {
     /// Returns the next message to send, and its connection.
     pub fn poll_message(&mut self, now: Duration) -> Option<(u64, KeyMessage)> {
         self.settle(now);
+        self.reclaim_from_copies(now);
         self.drop_unanswered(now);
         let message = self.outbox.pop_front().or_else(|| self.announce(now));
         self.plan(now);
@@ -362,13 +373,15 @@ impl KeySender {
 
     /// Returns when to poll again without other cause.
     pub fn poll_timeout(&self) -> Option<Duration> {
+        let silent = self.standby.as_ref().and_then(ConnectionKeys::unanswered_since);
+        let silent = silent.map(|since| since + COPY_ANSWER_WITHIN);
         let of_connection = |keys: &ConnectionKeys| {
             let unanswered = keys.unanswered_since().map(|since| since + ANSWER_WITHIN);
             [keys.spent_at(), unanswered].into_iter().flatten().min()
         };
         let keys = self.connections().filter_map(of_connection).min();
         let calls = self.in_use.as_ref().and_then(|_| self.pool.poll_timeout());
-        [keys, calls].into_iter().flatten().min()
+        [keys, calls, silent].into_iter().flatten().min()
     }
 
     /// Returns whether nothing can be sealed because this host's KME gives no keys. While the peer owes an answer for a
@@ -419,15 +432,42 @@ impl KeySender {
         self.in_use.iter().chain(&self.standby)
     }
 
+    /// Returns the number of keys to hold ahead for copies: none if no copies are sent, or the second path is silent.
+    fn copies_ahead(&self, now: Duration) -> usize {
+        let Some(standby) = &self.standby else { return 0 };
+        let is_silent = standby
+            .unanswered_since()
+            .is_some_and(|since| now.saturating_sub(since) >= COPY_ANSWER_WITHIN);
+        if is_silent { 0 } else { self.copy_demand.ahead_of_copies(now) }
+    }
+
+    /// Takes back the unused keys of the connection that stands by if no copies need them, or if the messages have none: they
+    /// are announced again on the connection in use.
+    fn reclaim_from_copies(&mut self, now: Duration) {
+        let is_needed = self.copies_ahead(now) > 0;
+        let has_keys = |keys: &ConnectionKeys| keys.ready() + keys.announced() > 0;
+        if is_needed && self.in_use.as_ref().is_none_or(has_keys) {
+            return;
+        }
+        let Some(standby) = self.standby.as_mut().filter(|standby| standby.ahead() > 0) else {
+            return;
+        };
+        let (conn, unused) = (standby.connection(), standby.release_unused());
+        self.put_back(conn, unused);
+    }
+
     /// Reports to the pool the number of keys to hold ahead, and the number of them that left it.
     fn plan(&mut self, now: Duration) {
-        let messages = self.demand.ahead(now);
-        let copies = self.standby.as_ref().map_or(0, |_| self.copy_demand.ahead_of_copies(now));
+        let (messages, copies) = (self.demand.ahead(now), self.copies_ahead(now));
+        let target = self.pool.set_ahead(messages + copies);
+        // The messages have their share first, however small the stock is.
+        let messages = messages.min(target);
+        let copies = copies.min(target - messages);
         let ahead = |keys: &Option<ConnectionKeys>| keys.as_ref().map_or(0, ConnectionKeys::ahead);
         // Surplus keys of one connection do not serve the other one.
         let elsewhere = ahead(&self.in_use).min(messages) + ahead(&self.standby).min(copies);
-        self.pool.plan(messages + copies, elsewhere);
-        self.share = (messages.min(self.pool.target()), copies);
+        self.pool.set_elsewhere(elsewhere);
+        self.share = (messages, copies);
     }
 
     /// Returns the number of READY keys that are reserved for RELIABLE and services, as last planned.

@@ -24,8 +24,7 @@ impl Links {
             return CopyBatch::default();
         };
         let since = standby.watch.as_ref().and_then(AnswerWatch::since);
-        let room = standby.copies.room(&standby.quic, since, now);
-        CopyBatch { connection, room, copies: Vec::new() }
+        standby.copies.batch(connection, &standby.quic, since, now)
     }
 
     /// Sends copies over the second path to a peer.
