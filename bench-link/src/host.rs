@@ -87,6 +87,12 @@ impl Host {
         address(0, self.number)
     }
 
+    /// Returns the file of its network namespace, for `nsenter`.
+    pub(crate) fn namespace(&self) -> Result<PathBuf> {
+        let thread = self.within(|| fs::read_link("/proc/thread-self"))??;
+        Ok(Path::new("/proc").join(thread).join("ns/net"))
+    }
+
     /// Does something in the host's namespace.
     pub(crate) fn within<T: Send + 'static>(
         &self,

@@ -5,6 +5,7 @@
 
 mod host;
 mod kmes;
+mod lend;
 mod mode;
 mod part;
 mod path;
@@ -50,19 +51,19 @@ struct Arguments {
     #[arg(value_enum)]
     scenarios: Vec<Scenario>,
     /// The path's rate in Mbit/s.
-    #[arg(long, default_value_t = 54.0)]
+    #[arg(long, global = true, default_value_t = 54.0)]
     rate: f64,
     /// The path's round trip in milliseconds.
-    #[arg(long, default_value_t = 3.0)]
+    #[arg(long, global = true, default_value_t = 3.0)]
     round_trip: f64,
     /// Bytes that may wait for their turn, each way.
-    #[arg(long, default_value_t = 256 << 10)]
+    #[arg(long, global = true, default_value_t = 256 << 10)]
     queue: usize,
     /// Losses in percent, both ways.
-    #[arg(long, value_delimiter = ',', default_values_t = [0.0, 10.0, 20.0, 30.0, 40.0])]
+    #[arg(long, global = true, value_delimiter = ',', default_values_t = [0.0, 10.0, 20.0, 30.0, 40.0])]
     losses: Vec<f64>,
     /// Packets that are lost in a row, on average.
-    #[arg(long, default_value_t = 1.0)]
+    #[arg(long, global = true, default_value_t = 1.0)]
     burst: f64,
     /// How long each stream flows, in seconds; paths and torture: how long all flow [default: 20; paths: 60; torture: 3600].
     #[arg(long)]
@@ -74,7 +75,7 @@ struct Arguments {
     #[arg(long, default_value = "auto", value_parser = ["auto", "delay", "cubic", "bbr"])]
     congestion: String,
     /// Decides which packets are lost.
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, global = true, default_value_t = 1)]
     seed: u64,
     /// Writes the figures to this file.
     #[arg(long)]
@@ -89,6 +90,11 @@ enum Command {
     /// Is a program of a measurement.
     #[command(hide = true)]
     Part { part: String },
+    /// Lends the two hosts and the path between them to other programs, until the standard input ends.
+    ///
+    /// Prints how the hosts are entered, and at the end what became of the packets, as a line of JSON each. `--losses`
+    /// names one loss.
+    Relay,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -145,6 +151,13 @@ fn run(arguments: &Arguments) -> Result<()> {
     }
     let path = path(arguments)?;
     host::prepare()?;
+    if let Some(Command::Relay) = &arguments.command {
+        let [percent] = arguments.losses[..] else {
+            return Err("relay takes one loss, for example --losses 20".into());
+        };
+        let loss = Loss { share: percent / 100.0, burst: arguments.burst };
+        return lend::lend(Settings { loss, ..path }, arguments.seed);
+    }
     println!(
         "{} Mbit/s, round trip {} ms, queue {} bytes, bursts of {} packets; congestion = {}; TCP with the kernel's {}",
         arguments.rate,

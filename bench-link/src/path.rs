@@ -3,6 +3,7 @@
 use std::time::{Duration, Instant};
 
 use rand::{RngExt, rngs::StdRng};
+use serde::Serialize;
 
 /// Which packets are lost on the air. They take their time there, as the frames of a radio do.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -32,7 +33,7 @@ pub(crate) struct Settings {
 }
 
 /// Counters of packets, by their fate.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub(crate) struct Counters {
     pub(crate) packets: u64,
     pub(crate) lost: u64,

@@ -56,7 +56,14 @@ impl Relay {
 
     /// What became of the packets from the first host to the second so far.
     pub(crate) fn counters(&self) -> Counters {
-        self.directions[0].lock().unwrap_or_else(PoisonError::into_inner).counters
+        self.counters_both_ways()[0]
+    }
+
+    /// The same from each host to the other one.
+    pub(crate) fn counters_both_ways(&self) -> [Counters; 2] {
+        self.directions
+            .each_ref()
+            .map(|direction| direction.lock().unwrap_or_else(PoisonError::into_inner).counters)
     }
 }
 

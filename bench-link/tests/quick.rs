@@ -3,7 +3,11 @@
 #[path = "../../axon-transport/daemon/tests/support/excerpt.rs"]
 mod excerpt;
 
-use std::{fs, process::Command};
+use std::{
+    fs,
+    io::{BufRead, BufReader},
+    process::{Command, Stdio},
+};
 
 use excerpt::excerpt;
 use serde_json::Value;
@@ -76,4 +80,51 @@ fn torture_accounts_for_every_sample() {
         assert!(topic["published"].as_u64().unwrap() > 0, "{topic}");
         assert_eq!((&topic["repeated"], &topic["unaccounted"]), (&0.into(), &0.into()), "{topic}");
     }
+}
+
+/// A program that this one did not start enters the first host, and reaches the second one over the path.
+#[test]
+fn other_programs_enter_the_hosts_that_it_lends() {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_axon-bench-link"));
+    command.args(["relay", "--losses", "0", "--round-trip", "2"]);
+    command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
+    let mut relay = command.spawn().unwrap();
+    let mut output = BufReader::new(relay.stdout.take().unwrap());
+    let mut line = String::new();
+    output.read_line(&mut line).unwrap();
+    if line.is_empty() {
+        let said = String::from_utf8(relay.wait_with_output().unwrap().stderr).unwrap();
+        assert!(NOT_HERE.iter().any(|why| said.contains(why)), "{said}");
+        eprintln!("skipped: hosts in network namespaces, {said}");
+        return;
+    }
+    let there: Value = serde_json::from_str(&line).unwrap();
+    let mut enter = Command::new("nsenter");
+    enter.arg(format!("--net={}", there["hosts"][0]["network"].as_str().unwrap()));
+    if !nix::unistd::getuid().is_root() {
+        enter.arg(format!("--user={}", there["user"].as_str().unwrap()));
+        enter.arg("--preserve-credentials");
+    }
+    // The refusal has crossed the path, as had the request.
+    let port = format!("/dev/tcp/{}/9", there["hosts"][1]["address"].as_str().unwrap());
+    let refused = enter.args(["bash", "-c", &format!("exec 3<>{port}")]).output().unwrap();
+    let said = String::from_utf8_lossy(&refused.stderr);
+    assert!(said.contains("Connection refused"), "{said}");
+    // The hosts end with its standard input; then it says what crossed.
+    drop(relay.stdin.take());
+    let mut last = String::new();
+    output.read_line(&mut last).unwrap();
+    let counters: Value = serde_json::from_str(&last).unwrap();
+    let crossed = |from: usize| counters[from]["packets"].as_u64().unwrap();
+    assert!(crossed(0) > 0 && crossed(1) > 0, "{counters}");
+    assert!(relay.wait().unwrap().success());
+}
+
+#[test]
+fn a_relay_of_several_losses_is_refused() {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_axon-bench-link"));
+    let output = command.args(["relay", "--losses", "10,20"]).output().unwrap();
+    assert!(!output.status.success());
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(said.contains("relay takes one loss"), "{}", excerpt("stderr", &said));
 }
