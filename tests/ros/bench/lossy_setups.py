@@ -62,7 +62,8 @@ FAST_DDS = """<?xml version="1.0" encoding="UTF-8"?>
 class Setup:
     """One implementation in one set-up."""
 
-    def __init__(self, name, library, setup, sysctl=(), daemon=None, waits=False):
+    def __init__(self, name, library, setup, sysctl=(), daemon=None, waits=False,
+                 best_effort_after=0):
         self.name = name
         self.library = library
         # (directory, addresses, number of the host) -> variables
@@ -73,6 +74,8 @@ class Setup:
         self.daemon = daemon
         # A publisher of large messages has KEEP_ALL, so that `publish` waits until the path has taken one.
         self.waits = waits
+        # Seconds until a second link for BEST_EFFORT stands, also where the path loses its first packets.
+        self.best_effort_after = best_effort_after
 
     def environment(self, directory, addresses, number):
         """The variables of the programs of a host, which keep their files in `directory`."""
@@ -82,7 +85,8 @@ class Setup:
         env.update(
             RMW_IMPLEMENTATION=self.library, ROS_DOMAIN_ID='77', ROS_LOG_DIR=str(directory),
             ROS_AUTOMATIC_DISCOVERY_RANGE='SUBNET', RCUTILS_LOGGING_SEVERITY='ERROR',
-            **self._setup(pathlib.Path(directory), addresses, number))
+            # Zenoh writes its log to the standard output.
+            RUST_LOG='off', **self._setup(pathlib.Path(directory), addresses, number))
         return env
 
 
@@ -134,7 +138,8 @@ ALL = [
     Setup('rmw_fastrtps_cpp, LARGE_DATA', 'rmw_fastrtps_cpp',
           lambda *_: {'FASTDDS_BUILTIN_TRANSPORTS': 'LARGE_DATA'}, FRAGMENTS, waits=True),
     Setup('rmw_zenoh_cpp', 'rmw_zenoh_cpp', as_it_comes, daemon=('rmw_zenohd', zenoh_router)),
-    Setup('rmw_zenoh_cpp, tuned', 'rmw_zenoh_cpp', zenoh_direct, waits=True),
+    Setup('rmw_zenoh_cpp, tuned', 'rmw_zenoh_cpp', zenoh_direct, waits=True,
+          best_effort_after=15),
 ]
 
 
