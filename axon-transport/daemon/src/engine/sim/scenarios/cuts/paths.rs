@@ -268,7 +268,7 @@ fn small_samples_cross_both_paths_by_default_or_by_a_rule() {
 #[test]
 fn lossy_paths_that_are_cut_in_turn_lose_nothing_and_repeat_nothing() {
     for (mode, config) in modes() {
-        let mut paths = TwoPaths::new(73, &config);
+        let mut paths = TwoPaths::with(73, with_rule(&config, Some(true)));
         paths.every = 20;
         let lossy = Path { loss: 0.2, jitter: millis(8), delay: millis(2), ..Path::default() };
         paths.world.network.set_default_path(lossy);
@@ -395,7 +395,7 @@ fn one_host_with_one_path_has_no_second_link() {
 #[test]
 fn renewals_of_both_links_lose_nothing_and_leave_a_second_link() {
     for mode in [KeyMode::Session, KeyMode::Messages10] {
-        let mut paths = TwoPaths::with(66, with_paths(short_lived(mode), |_| 2));
+        let mut paths = TwoPaths::with(66, with_rule(short_lived(mode), Some(true)));
         for _ in 0..12 {
             paths.publish(secs(10));
         }
