@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT OR Apache-2.0
 """The results over a path that loses packets as tables, in Markdown: a line for each implementation."""
 
+from table import cell
+
 FRESH_MS = 250
 
 
@@ -39,9 +41,3 @@ def render(results):
             lines.append(f'| {name} | ' + ' | '.join(of_losses) + ' |')
         lines.append('')
     return '\n'.join(lines)
-
-
-def cell(row, text):
-    if row is None:
-        return '-'
-    return row['failed'] if 'failed' in row else text(row)

@@ -24,8 +24,10 @@ use crate::{
 /// Maximum number of copies in flight. Before a link is elected its peer allows 128 streams at a time, which are also for
 /// those that the election precedes.
 const MOST: usize = 96;
-/// Bytes of the start of a copy's stream, and of the header and envelope of its message, at most.
-const MAX_START: usize = HEADER + size_of::<u64>() + size_of::<u32>() + MAX_OVERHEAD;
+/// Bytes before the message of a copy in its stream: the header, and the number of the sample before it.
+const START: usize = HEADER + size_of::<u64>();
+/// Bytes of a copy's stream besides the payload, at most: the message has a length, a header and an envelope.
+const MAX_AROUND: usize = START + size_of::<u32>() + MAX_OVERHEAD;
 /// Maximum number of copies in flight of one flow, so that a fast flow leaves some to the others.
 const MOST_OF_FLOW: usize = 32;
 /// Time without an answer, and number of round trips, after which the second path counts as silent.
@@ -74,12 +76,12 @@ impl CopyBatch {
     /// be used up for nothing.
     pub(in crate::engine) fn takes(&self, header: &StreamHeader, payload: usize) -> bool {
         let of_flow = self.of_flow.get(&(header.route, header.of)).copied().unwrap_or(0);
-        self.has_room() && of_flow < MOST_OF_FLOW && payload + MAX_START <= self.room.1
+        self.has_room() && of_flow < MOST_OF_FLOW && payload + MAX_AROUND <= self.room.1
     }
 
     /// Adds a copy.
     pub(in crate::engine) fn add(&mut self, copy: SampleCopy) {
-        let bytes = MAX_START + copy.frames.iter().map(Bytes::len).sum::<usize>();
+        let bytes = START + copy.frames.iter().map(Bytes::len).sum::<usize>();
         self.room.1 = self.room.1.saturating_sub(bytes);
         *self.of_flow.entry((copy.header.route, copy.header.of)).or_default() += 1;
         self.copies.push(copy);
@@ -128,7 +130,7 @@ impl CopyStreams {
         }
         // One copy may always be in flight.
         let bytes = match self.in_flight.is_empty() {
-            true => most_bytes(quic).max(MAX_START + SMALL),
+            true => most_bytes(quic).max(MAX_AROUND + SMALL),
             false => most_bytes(quic).saturating_sub(self.bytes),
         };
         batch.room = (MOST.saturating_sub(self.in_flight.len()), bytes);

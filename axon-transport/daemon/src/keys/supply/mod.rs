@@ -8,9 +8,12 @@
 mod connection_keys;
 mod demand;
 mod disagreement;
+mod key_plan;
 mod pool;
 mod receiver;
 mod sender;
+mod sender_connections;
+mod sender_statistics;
 
 #[cfg(test)]
 mod tests;
@@ -20,7 +23,8 @@ use axon_envelope::{ChannelError, RandomError};
 pub use demand::SupplyWarning;
 pub use disagreement::Disagreement;
 pub use receiver::{KeyReceiver, ReceiverStatistics};
-pub use sender::{KeySender, NoKey, SenderStatistics};
+pub use sender::{KeySender, NoKey};
+pub use sender_statistics::SenderStatistics;
 
 use super::KeyViolation;
 

@@ -9,14 +9,15 @@ use axon_envelope::{
     Channel, ChannelError, Delivery, KeyId, KmeKey, MAX_HEADER_LEN, MESSAGES_PER_KEY, Retirement,
     Slot, TAG_LEN,
 };
-use serde::Serialize;
 
 use super::{
     Disagreement, MAX_UNRETIRED, SupplyError, SupplyWarning,
     connection_keys::{AnnouncedKey, ConnectionKeys, ReleasedKeys},
-    demand::{self, Demand},
     disagreement::Disagreements,
+    key_plan::KeyPlan,
     pool::{KeyStock, UnusedKey},
+    sender_connections::SenderConnections,
+    sender_statistics::{SenderCounts, SenderStatistics},
 };
 use crate::{
     keys::{
@@ -29,37 +30,18 @@ use crate::{
 /// The longest wait for READY or FAILED of an announced key, over all connections that it is announced on. It is longer
 /// than the receiver's attempts.
 const ANSWER_WITHIN: Duration = Duration::from_secs(60);
-/// The longest wait for the answer for a key of copies, after which their connection counts as silent.
-const COPY_ANSWER_WITHIN: Duration = Duration::from_secs(10);
 
 /// The keys of this host's messages to one peer.
 pub struct KeySender {
     local: String,
     peer: String,
-    /// The connection over which messages leave.
-    in_use: Option<ConnectionKeys>,
-    /// The connection that stands by, over which copies of messages leave.
-    standby: Option<ConnectionKeys>,
+    connections: SenderConnections,
     /// Keys that are drawn or being drawn, and have to be announced.
     pool: KeyStock,
     outbox: VecDeque<(u64, KeyMessage)>,
-    demand: Demand,
-    /// The demand of the copies.
-    copy_demand: Demand,
-    /// The numbers of keys ahead for messages, within the KME's stock, and for copies, as last planned.
-    share: (usize, usize),
+    plan: KeyPlan,
     disagreements: Disagreements,
     counts: SenderCounts,
-}
-
-#[derive(Default)]
-struct SenderCounts {
-    sealed: u64,
-    retired: u64,
-    failed: u64,
-    disagreed: u64,
-    no_key: u64,
-    last_failure: Option<String>,
 }
 
 /// The reason for which no message can be sealed now.
@@ -75,38 +57,6 @@ pub enum NoKey {
     /// There is no connection.
     #[error("no_key: no connection")]
     Detached,
-}
-
-/// The statistics of a [`KeySender`], for status. Rates are keys per second.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-#[non_exhaustive]
-pub struct SenderStatistics {
-    /// Keys that are READY, including the key in use.
-    pub ready: usize,
-    /// Keys that are announced and not answered.
-    pub announced: usize,
-    /// Keys that are requested and have not arrived.
-    pub asked: usize,
-    /// The number of keys that should be in flight or READY, within the KME's stock.
-    pub target: usize,
-    /// Keys per second that the messages need.
-    pub demand: f64,
-    /// Keys per second that the KME gives, if the KME was observed at its limit.
-    pub supply: Option<f64>,
-    /// The time from the request for a key to READY, in milliseconds.
-    pub lead_ms: f64,
-    /// Messages that were sealed under retired keys.
-    pub sealed: u64,
-    /// Retired keys.
-    pub retired: u64,
-    /// Keys that the peer could not fetch or did not answer, or that the KME gave before.
-    pub failed: u64,
-    /// Keys whose proof did not match: the peer's KME gave it another key under the same key_ID.
-    pub disagreed: u64,
-    /// The number of times that a message was refused for lack of a key.
-    pub no_key: u64,
-    /// The reason for which the last key or call failed.
-    pub last_failure: Option<String>,
 }
 
 impl KeySender {
@@ -128,13 +78,10 @@ impl KeySender {
         let mut sender = Self {
             local: local_sae.to_owned(),
             peer: peer_sae.to_owned(),
-            in_use: None,
-            standby: None,
+            connections: SenderConnections::default(),
             pool: KeyStock::new(jitter),
             outbox: VecDeque::new(),
-            demand: Demand::new(),
-            copy_demand: Demand::new(),
-            share: (0, 0),
+            plan: KeyPlan::new(),
             disagreements: Disagreements::default(),
             counts: SenderCounts::default(),
         };
@@ -155,12 +102,12 @@ impl KeySender {
         conn: u64,
         exporters: &Exporters,
     ) -> Result<Vec<(u64, KeyMessage)>, SupplyError> {
-        let next = match self.standby.take_if(|standby| standby.connection() == conn) {
+        let next = match self.connections.standby.take_if(|standby| standby.connection() == conn) {
             Some(standby) => standby,
             None => ConnectionKeys::new(conn, (&self.local, &self.peer), exporters)?,
         };
         self.settle(now);
-        let before = self.in_use.replace(next);
+        let before = self.connections.in_use.replace(next);
         let Some(mut before) = before else { return Ok(Vec::new()) };
         let number = before.connection();
         self.put_back(number, before.release());
@@ -183,17 +130,19 @@ impl KeySender {
             return Ok(());
         }
         let next = ConnectionKeys::new(conn, (&self.local, &self.peer), exporters)?;
-        if let Some(before) = self.standby.as_ref().map(ConnectionKeys::connection) {
+        if let Some(before) = self.connections.standby.as_ref().map(ConnectionKeys::connection) {
             self.detach(now, before);
         }
-        self.standby = Some(next);
+        self.connections.standby = Some(next);
         Ok(())
     }
 
     /// Ends the use of a connection that stood by, which was superseded and is not closed yet.
     pub fn release_standby(&mut self, now: Duration, conn: u64) {
         self.settle(now);
-        if let Some(mut standby) = self.standby.take_if(|standby| standby.connection() == conn) {
+        if let Some(mut standby) =
+            self.connections.standby.take_if(|standby| standby.connection() == conn)
+        {
             self.put_back(conn, standby.release());
         }
     }
@@ -201,10 +150,7 @@ impl KeySender {
     /// Detaches a closed connection. Keys that sealed no message wait for the next connection.
     pub fn detach(&mut self, now: Duration, conn: u64) {
         self.settle(now);
-        let is_closed = |keys: &mut ConnectionKeys| keys.connection() == conn;
-        for mut closed in
-            [self.in_use.take_if(is_closed), self.standby.take_if(is_closed)].into_iter().flatten()
-        {
+        if let Some(mut closed) = self.connections.take(conn) {
             self.put_back(conn, closed.release());
         }
         self.outbox.retain(|(of, _)| *of != conn);
@@ -212,7 +158,7 @@ impl KeySender {
 
     /// Returns the connection that [`slot`](Self::slot) seals for. The sealed messages open on no other connection.
     pub fn attached(&self) -> Option<u64> {
-        self.in_use.as_ref().map(ConnectionKeys::connection)
+        self.connections.in_use.as_ref().map(ConnectionKeys::connection)
     }
 
     /// Adds a key that the peer has proven to hold on `conn`, as READY. If `conn` is not attached, the key has to be
@@ -232,10 +178,10 @@ impl KeySender {
             return Ok(());
         }
         if let Err(why) = self.pool.admit(&key_id) {
-            self.failed(why);
+            self.counts.failed(why);
             return Ok(());
         }
-        match &mut self.in_use {
+        match &mut self.connections.in_use {
             Some(keys) if keys.connection() == conn => keys.add_ready(key_id, key)?,
             _ => self.pool.put(now, key_id, key),
         }
@@ -244,12 +190,12 @@ impl KeySender {
 
     /// Counts `messages` more that are to be sent to this peer. Each message counts once, however often it is tried.
     pub fn demand(&mut self, now: Duration, messages: u32) {
-        self.demand.messages(now, messages);
+        self.plan.messages(now, messages);
     }
 
     /// Counts `messages` more whose copies are to be sent over the connection that stands by.
     pub fn demand_copies(&mut self, now: Duration, messages: u32) {
-        self.copy_demand.messages(now, messages);
+        self.plan.copies(now, messages);
     }
 
     /// Returns a permit to seal one message, at once and on the attached connection. Services seal as
@@ -264,7 +210,7 @@ impl KeySender {
             self.counts.no_key += 1;
             return Err(no_key);
         }
-        self.in_use.as_mut().ok_or(NoKey::Detached)?.slot(now, delivery)
+        self.connections.in_use.as_mut().ok_or(NoKey::Detached)?.slot(now, delivery)
     }
 
     /// Returns a permit to seal one copy of a message, at once and on connection `conn`, which stands by. The peer waits for
@@ -275,24 +221,27 @@ impl KeySender {
     pub fn copy_slot(&mut self, now: Duration, conn: u64) -> Result<Slot<'_>, NoKey> {
         self.settle(now);
         self.plan(now);
-        let standby = self.standby.as_mut().filter(|standby| standby.connection() == conn);
+        let standby =
+            self.connections.standby.as_mut().filter(|standby| standby.connection() == conn);
         standby.ok_or(NoKey::Detached)?.slot(now, Delivery::BestEffort)
     }
 
     /// Returns the bytes that an envelope has in addition to its plaintext. It is an upper bound for the next
     /// [`slot`](Self::slot), because KMEs choose the names of keys.
     pub fn overhead(&self) -> usize {
-        self.in_use.as_ref().map_or(MAX_HEADER_LEN + TAG_LEN, ConnectionKeys::overhead)
+        self.connections.in_use.as_ref().map_or(MAX_HEADER_LEN + TAG_LEN, ConnectionKeys::overhead)
     }
 
     /// Returns the number of messages that could be sealed now, with the reserved keys as last planned.
     pub fn available(&self, delivery: Delivery) -> u32 {
-        let Some(keys) = self.in_use.as_ref().filter(|_| self.allowed(delivery).is_ok()) else {
+        let Some(keys) =
+            self.connections.in_use.as_ref().filter(|_| self.allowed(delivery).is_ok())
+        else {
             return 0;
         };
         let kept = match delivery {
             Delivery::Reliable => 0,
-            Delivery::BestEffort => self.reserve() as u32 * u32::from(MESSAGES_PER_KEY),
+            Delivery::BestEffort => self.plan.reserve() as u32 * u32::from(MESSAGES_PER_KEY),
         };
         keys.remaining().saturating_sub(kept)
     }
@@ -309,10 +258,7 @@ impl KeySender {
         message: &KeyMessage,
     ) -> Result<(), SupplyError> {
         // A late message on an earlier connection concerns keys that were announced again.
-        let both = [self.in_use.as_mut(), self.standby.as_mut()].into_iter().flatten();
-        let Some(keys) = both.into_iter().find(|keys| keys.connection() == conn) else {
-            return Ok(());
-        };
+        let Some(keys) = self.connections.get_mut(conn) else { return Ok(()) };
         match message {
             KeyMessage::Ready { key_id, proof } => {
                 let Some(proven) = keys.proves(key_id, proof) else { return Ok(()) };
@@ -320,7 +266,7 @@ impl KeySender {
                     self.give_up(now, conn, key_id);
                     self.counts.disagreed += 1;
                     self.disagreements.add(key_id.clone());
-                    self.failed(format!("peer holds another key under key_ID {key_id}"));
+                    self.counts.failed(format!("peer holds another key under key_ID {key_id}"));
                     return Ok(());
                 }
                 let Some(AnnouncedKey { key, asked, .. }) = keys.take_announced(key_id) else {
@@ -329,16 +275,14 @@ impl KeySender {
                 keys.add_ready(key_id.clone(), key)?;
                 self.pool.key_ready();
                 if let Some(asked) = asked {
-                    let lead = now.saturating_sub(asked);
-                    self.demand.ready(lead);
-                    self.copy_demand.ready(lead);
+                    self.plan.ready(now.saturating_sub(asked));
                 }
                 Ok(())
             }
             KeyMessage::Failed { key_id, reason } => {
                 if let Some(refused) = keys.take_announced(key_id) {
                     self.pool.key_refused(now, refused.since);
-                    self.failed(format!("peer could not fetch key_ID {key_id}: {reason}"));
+                    self.counts.failed(format!("peer could not fetch key_ID {key_id}: {reason}"));
                 }
                 Ok(())
             }
@@ -360,7 +304,7 @@ impl KeySender {
     pub fn poll_request(&mut self, now: Duration) -> Option<KmeRequest> {
         self.settle(now);
         self.plan(now);
-        self.in_use.as_ref()?;
+        self.connections.in_use.as_ref()?;
         self.pool.poll(now, &self.peer)
     }
 
@@ -373,35 +317,33 @@ impl KeySender {
 
     /// Returns when to poll again without other cause.
     pub fn poll_timeout(&self) -> Option<Duration> {
-        let silent = self.standby.as_ref().and_then(ConnectionKeys::unanswered_since);
-        let silent = silent.map(|since| since + COPY_ANSWER_WITHIN);
         let of_connection = |keys: &ConnectionKeys| {
             let unanswered = keys.unanswered_since().map(|since| since + ANSWER_WITHIN);
             [keys.spent_at(), unanswered].into_iter().flatten().min()
         };
-        let keys = self.connections().filter_map(of_connection).min();
-        let calls = self.in_use.as_ref().and_then(|_| self.pool.poll_timeout());
-        [keys, calls, silent].into_iter().flatten().min()
+        let keys = self.connections.iter().filter_map(of_connection).min();
+        let calls = self.connections.in_use.as_ref().and_then(|_| self.pool.poll_timeout());
+        [keys, calls, self.plan.poll_timeout(&self.connections)].into_iter().flatten().min()
     }
 
     /// Returns whether nothing can be sealed because this host's KME gives no keys. While the peer owes an answer for a
     /// key, the peer is the cause instead.
     pub fn lacks_keys_of_kme(&self) -> bool {
         let has_none = |keys: &ConnectionKeys| keys.ready() == 0 && keys.announced() == 0;
-        self.in_use.as_ref().is_none_or(has_none) && self.pool.fails()
+        self.connections.in_use.as_ref().is_none_or(has_none) && self.pool.fails()
     }
 
     /// Returns the statistics.
     pub fn statistics(&self, now: Duration) -> SenderStatistics {
         let pool = self.pool.status(now);
         SenderStatistics {
-            ready: self.connections().map(ConnectionKeys::ready).sum(),
-            announced: self.connections().map(ConnectionKeys::announced).sum(),
+            ready: self.connections.iter().map(ConnectionKeys::ready).sum(),
+            announced: self.connections.iter().map(ConnectionKeys::announced).sum(),
             asked: pool.asked,
             target: pool.target,
-            demand: self.keys_needed(now),
+            demand: self.plan.needed(now),
             supply: pool.supply,
-            lead_ms: self.demand.lead_time().as_secs_f64() * 1e3,
+            lead_ms: self.plan.lead_time().as_secs_f64() * 1e3,
             sealed: self.counts.sealed,
             retired: self.counts.retired,
             failed: self.counts.failed + pool.unusable,
@@ -414,8 +356,7 @@ impl KeySender {
     /// Returns a warning if the demand comes close to the supply; at most every ten seconds.
     pub fn warning(&mut self, now: Duration) -> Option<SupplyWarning> {
         let supply = self.pool.status(now).supply?;
-        let needed = self.keys_needed(now);
-        self.demand.warning(now, needed, supply)
+        self.plan.warning(now, supply)
     }
 
     /// Returns a report of keys that the peer holds with other bytes; at most every ten seconds.
@@ -423,33 +364,16 @@ impl KeySender {
         self.disagreements.take(now)
     }
 
-    /// Returns the keys per second that messages and copies need.
-    fn keys_needed(&self, now: Duration) -> f64 {
-        self.demand.demand(now) + self.copy_demand.demand(now)
-    }
-
-    fn connections(&self) -> impl Iterator<Item = &ConnectionKeys> {
-        self.in_use.iter().chain(&self.standby)
-    }
-
-    /// Returns the number of keys to hold ahead for copies: none if no copies are sent, or the second path is silent.
-    fn copies_ahead(&self, now: Duration) -> usize {
-        let Some(standby) = &self.standby else { return 0 };
-        let is_silent = standby
-            .unanswered_since()
-            .is_some_and(|since| now.saturating_sub(since) >= COPY_ANSWER_WITHIN);
-        if is_silent { 0 } else { self.copy_demand.ahead_of_copies(now) }
-    }
-
     /// Takes back the unused keys of the connection that stands by if no copies need them, or if the messages have none: they
     /// are announced again on the connection in use.
     fn reclaim_from_copies(&mut self, now: Duration) {
-        let is_needed = self.copies_ahead(now) > 0;
+        let is_needed = self.plan.copies_ahead(now, &self.connections) > 0;
         let has_keys = |keys: &ConnectionKeys| keys.ready() + keys.announced() > 0;
-        if is_needed && self.in_use.as_ref().is_none_or(has_keys) {
+        if is_needed && self.connections.in_use.as_ref().is_none_or(has_keys) {
             return;
         }
-        let Some(standby) = self.standby.as_mut().filter(|standby| standby.ahead() > 0) else {
+        let Some(standby) = self.connections.standby.as_mut().filter(|standby| standby.ahead() > 0)
+        else {
             return;
         };
         let (conn, unused) = (standby.connection(), standby.release_unused());
@@ -458,64 +382,37 @@ impl KeySender {
 
     /// Reports to the pool the number of keys to hold ahead, and the number of them that left it.
     fn plan(&mut self, now: Duration) {
-        let (messages, copies) = (self.demand.ahead(now), self.copies_ahead(now));
-        let target = self.pool.set_ahead(messages + copies);
-        // The messages have their share first, however small the stock is.
-        let messages = messages.min(target);
-        let copies = copies.min(target - messages);
-        let ahead = |keys: &Option<ConnectionKeys>| keys.as_ref().map_or(0, ConnectionKeys::ahead);
-        // Surplus keys of one connection do not serve the other one.
-        let elsewhere = ahead(&self.in_use).min(messages) + ahead(&self.standby).min(copies);
-        self.pool.set_elsewhere(elsewhere);
-        self.share = (messages, copies);
-    }
-
-    /// Returns the number of READY keys that are reserved for RELIABLE and services, as last planned.
-    fn reserve(&self) -> usize {
-        demand::reserve(self.share.0)
+        self.plan.update(now, &self.connections, &mut self.pool);
     }
 
     fn allowed(&self, delivery: Delivery) -> Result<(), NoKey> {
-        let Some(keys) = &self.in_use else { return Err(NoKey::Detached) };
+        let Some(keys) = &self.connections.in_use else { return Err(NoKey::Detached) };
         match (keys.ready(), delivery) {
             (0, _) => Err(NoKey::None),
-            (n, Delivery::BestEffort) if n <= self.reserve() => Err(NoKey::Reserved),
+            (n, Delivery::BestEffort) if n <= self.plan.reserve() => Err(NoKey::Reserved),
             _ => Ok(()),
         }
     }
 
     /// Retires the keys in use that are finished.
     fn settle(&mut self, now: Duration) {
-        while let Some((conn, retired)) = self.poll_spent(now) {
+        while let Some((conn, retired)) = self.connections.poll_spent(now) {
             self.retire(conn, retired);
         }
     }
 
-    fn poll_spent(&mut self, now: Duration) -> Option<(u64, Retirement)> {
-        let both = [self.in_use.as_mut(), self.standby.as_mut()].into_iter().flatten();
-        let mut spent = both.filter_map(|keys| Some((keys.connection(), keys.retire_spent(now)?)));
-        spent.next()
-    }
-
     fn drop_unanswered(&mut self, now: Duration) {
-        let since = now.checked_sub(ANSWER_WITHIN);
-        let late: Vec<(u64, KeyId)> = self
-            .connections()
-            .flat_map(|keys| keys.unanswered(since).into_iter().map(|id| (keys.connection(), id)))
-            .collect();
-        for (conn, key_id) in late {
+        for (conn, key_id) in self.connections.unanswered(now.checked_sub(ANSWER_WITHIN)) {
             self.give_up(now, conn, &key_id);
-            self.failed(format!("peer did not answer ANNOUNCE of key_ID {key_id}"));
+            self.counts.failed(format!("peer did not answer ANNOUNCE of key_ID {key_id}"));
         }
     }
 
     /// Erases an announced key that will seal no message, and asks the peer to erase its own.
     fn give_up(&mut self, now: Duration, conn: u64, key_id: &KeyId) {
-        let both = [self.in_use.as_mut(), self.standby.as_mut()].into_iter().flatten();
-        for keys in both.filter(|keys| keys.connection() == conn) {
-            if let Some(refused) = keys.take_announced(key_id) {
-                self.pool.key_refused(now, refused.since);
-            }
+        let keys = self.connections.get_mut(conn);
+        if let Some(refused) = keys.and_then(|keys| keys.take_announced(key_id)) {
+            self.pool.key_refused(now, refused.since);
         }
         let (used, reliable) = Default::default();
         let retire = KeyMessage::Retire { key_id: key_id.clone(), used, reliable };
@@ -523,8 +420,7 @@ impl KeySender {
     }
 
     fn retire(&mut self, conn: u64, retirement: Retirement) {
-        self.counts.retired += 1;
-        self.counts.sealed += retirement.used.len() as u64;
+        self.counts.retired(&retirement);
         let (key_id, used) = (retirement.key_id, retirement.used);
         let retire = KeyMessage::Retire { key_id, used, reliable: retirement.reliable };
         self.outbox.push_back((conn, retire));
@@ -532,27 +428,25 @@ impl KeySender {
 
     /// Announces keys of the pool.
     fn announce(&mut self, now: Duration) -> Option<(u64, KeyMessage)> {
-        let held: usize = self.connections().map(|keys| keys.ready() + keys.announced()).sum();
-        let room = MAX_UNRETIRED.saturating_sub(held).min(MAX_ANNOUNCED);
+        let room = MAX_UNRETIRED.saturating_sub(self.connections.held()).min(MAX_ANNOUNCED);
         let (mut key_ids, mut of_copies) = (Vec::new(), Vec::new());
         while key_ids.len() + of_copies.len() < room
-            && let Some(in_use) = &mut self.in_use
+            && let Some(in_use) = &mut self.connections.in_use
             && let Some(UnusedKey { key_id, key, asked, announced }) = self.pool.take(now)
         {
             let since = announced.unwrap_or(now);
             if now.saturating_sub(since) >= ANSWER_WITHIN {
                 self.pool.key_refused(now, since);
-                self.failed(format!("peer did not answer ANNOUNCE of key_ID {key_id}"));
+                self.counts.failed(format!("peer did not answer ANNOUNCE of key_ID {key_id}"));
                 continue;
             }
             // The peer may hold an earlier key for a connection that was in use, from which it moves none to one that stands
             // by. Keys from the KME have the time of their request.
             let is_new = asked.is_some();
-            let (messages, copies) = self.share;
-            let standby = self
-                .standby
-                .as_mut()
-                .filter(|standby| is_new && in_use.ahead() >= messages && standby.ahead() < copies);
+            let share = self.plan.share();
+            let standby = self.connections.standby.as_mut().filter(|standby| {
+                is_new && in_use.ahead() >= share.messages && standby.ahead() < share.copies
+            });
             let announced = AnnouncedKey { key, asked, since };
             match standby {
                 Some(standby) => {
@@ -569,8 +463,8 @@ impl KeySender {
             let conn = keys.as_ref().filter(|_| !key_ids.is_empty())?.connection();
             Some((conn, KeyMessage::Announce(key_ids)))
         };
-        self.outbox.extend(announce(&self.in_use, key_ids));
-        self.outbox.extend(announce(&self.standby, of_copies));
+        self.outbox.extend(announce(&self.connections.in_use, key_ids));
+        self.outbox.extend(announce(&self.connections.standby, of_copies));
         self.outbox.pop_front()
     }
 
@@ -590,12 +484,6 @@ impl KeySender {
 
     fn unretired(&self, now: Duration) -> usize {
         let pool = self.pool.status(now);
-        let held: usize = self.connections().map(|keys| keys.ready() + keys.announced()).sum();
-        pool.held + pool.asked + held
-    }
-
-    fn failed(&mut self, why: String) {
-        self.counts.failed += 1;
-        self.counts.last_failure = Some(why);
+        pool.held + pool.asked + self.connections.held()
     }
 }

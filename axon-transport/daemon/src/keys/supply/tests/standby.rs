@@ -11,6 +11,15 @@ use crate::keys::{KeyMessage, NoKey};
 const STANDBY: u64 = 77;
 
 impl Pair {
+    /// Returns a pair whose messages and copies have keys.
+    fn with_copies() -> Self {
+        let mut pair = Self::new();
+        pair.stand_by(STANDBY);
+        pair.seal_copy().unwrap_err();
+        pair.run();
+        pair
+    }
+
     /// Attaches a connection that stands by.
     fn stand_by(&mut self, conn: u64) {
         self.receiver.attach(self.now, conn, &exporters(conn)).unwrap();
@@ -73,10 +82,7 @@ fn copies_draw_no_key_before_the_first_one_and_open_on_their_connection_alone() 
 
 #[test]
 fn no_key_seals_on_two_connections_or_more_than_ten_times() {
-    let mut pair = Pair::new();
-    pair.stand_by(STANDBY);
-    pair.seal_copy().unwrap_err();
-    pair.run();
+    let mut pair = Pair::with_copies();
     for round in 0..200 {
         pair.now += ms(10);
         let (message, copy) = (pair.seal(Delivery::Reliable), pair.seal_copy());
@@ -98,10 +104,7 @@ fn no_key_seals_on_two_connections_or_more_than_ten_times() {
 
 #[test]
 fn connection_that_takes_over_keeps_its_keys_and_needs_no_announcement() {
-    let mut pair = Pair::new();
-    pair.stand_by(STANDBY);
-    pair.seal_copy().unwrap_err();
-    pair.run();
+    let mut pair = Pair::with_copies();
     let copy = pair.seal_copy().unwrap();
     pair.seal(Delivery::Reliable).unwrap();
     let owed = pair.take_over();
@@ -126,10 +129,7 @@ fn connection_that_takes_over_keeps_its_keys_and_needs_no_announcement() {
 
 #[test]
 fn unused_keys_of_a_connection_that_stood_by_serve_the_one_in_use() {
-    let mut pair = Pair::new();
-    pair.stand_by(STANDBY);
-    pair.seal_copy().unwrap_err();
-    pair.run();
+    let mut pair = Pair::with_copies();
     pair.seal_copy().unwrap();
     let (drawn, before) = (pair.kmes.issued, pair.log.len());
     pair.standby = None;
@@ -198,10 +198,7 @@ fn keys_of_copies_leave_a_low_stock_to_the_messages() {
 
 #[test]
 fn unused_keys_of_copies_serve_the_messages_once_the_kme_gives_none() {
-    let mut pair = Pair::new();
-    pair.stand_by(STANDBY);
-    pair.seal_copy().unwrap_err();
-    pair.run();
+    let mut pair = Pair::with_copies();
     let keys = pair.sender.statistics(pair.now).ready;
     assert_eq!(keys, 8, "four for messages, four for copies");
     pair.kmes.left = Some(0);
@@ -242,10 +239,7 @@ fn keys_of_copies_on_a_silent_path_are_not_lost() {
 
 #[test]
 fn key_that_moves_to_another_connection_and_back_is_readied_again() {
-    let mut pair = Pair::new();
-    pair.stand_by(STANDBY);
-    pair.seal_copy().unwrap_err();
-    pair.run();
+    let mut pair = Pair::with_copies();
     // Its keys move to the connection in use, whose path is cut: the announcement does not arrive.
     pair.now += ms(60_000);
     let moved = pair.sender.poll_message(pair.now);
@@ -315,10 +309,7 @@ fn keys_of_copies_that_are_no_longer_sent_do_not_count_for_messages() {
 
 #[test]
 fn connection_that_ends_while_another_stands_by_leaves_that_one_its_keys() {
-    let mut pair = Pair::new();
-    pair.stand_by(STANDBY);
-    pair.seal_copy().unwrap_err();
-    pair.run();
+    let mut pair = Pair::with_copies();
     pair.close(1);
     assert_eq!(pair.seal(Delivery::Reliable), Err(NoKey::Detached));
     let copy = pair.seal_copy().unwrap();
@@ -330,10 +321,7 @@ fn connection_that_ends_while_another_stands_by_leaves_that_one_its_keys() {
 
 #[test]
 fn second_connection_that_stands_by_replaces_the_first() {
-    let mut pair = Pair::new();
-    pair.stand_by(STANDBY);
-    pair.seal_copy().unwrap_err();
-    pair.run();
+    let mut pair = Pair::with_copies();
     pair.stand_by(STANDBY + 1);
     assert_eq!(pair.sender.copy_slot(pair.now, STANDBY).err(), Some(NoKey::Detached));
     // Another READY of the first one concerns no key.
