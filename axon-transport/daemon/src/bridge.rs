@@ -162,6 +162,8 @@ pub enum ToControl {
         daemon: DaemonId,
         /// The confidence in the address, as the order stated it.
         standing: AddressConfidence,
+        /// The address at which an authenticated peer answered that it is another daemon, or that it ends.
+        absent_at: Option<SocketAddr>,
     },
     /// Discovery datagrams that arrived at the QUIC port.
     Datagrams(Datagrams),

@@ -182,8 +182,9 @@ impl DaemonGateway {
                 self.linked.remove(daemon);
                 self.tell(DiscoveryEvent::LinkDown { daemon: *daemon });
             }
-            ToControl::DialFailed { daemon, standing } => {
-                self.tell(DiscoveryEvent::DialFailed { daemon: *daemon, standing: *standing });
+            ToControl::DialFailed { daemon, standing, absent_at } => {
+                let (daemon, standing, absent_at) = (*daemon, *standing, *absent_at);
+                self.tell(DiscoveryEvent::DialFailed { daemon, standing, absent_at });
             }
             ToControl::Path { daemon, works } => {
                 self.tell(DiscoveryEvent::Path { daemon: *daemon, works: *works });
@@ -202,7 +203,8 @@ impl DaemonGateway {
             DiscoveryAction::Dial { daemon, sae, addrs: addresses, listed, standing } => {
                 let dial = ToGateway::Dial { daemon, sae, addresses, listed, standing };
                 if !self.order(dial) {
-                    self.tell(DiscoveryEvent::DialFailed { daemon, standing });
+                    let absent_at = None;
+                    self.tell(DiscoveryEvent::DialFailed { daemon, standing, absent_at });
                 }
             }
             DiscoveryAction::Addresses { daemon, addresses } => {

@@ -74,6 +74,8 @@ pub(crate) enum DiscoveryEvent {
         daemon: DaemonId,
         /// The standing, as in the action.
         standing: AddressConfidence,
+        /// The address at which an authenticated peer answered that it is another daemon, or that it ends.
+        absent_at: Option<SocketAddr>,
     },
     /// The graph has a new digest.
     GraphDigest(u64),
@@ -251,7 +253,10 @@ impl DiscoveryIo {
             }
             DiscoveryEvent::LinkDown { daemon } => self.peers.handle_link_down(now, daemon),
             DiscoveryEvent::Path { daemon, works } => self.peers.handle_path(now, daemon, works),
-            DiscoveryEvent::DialFailed { daemon, standing } => {
+            DiscoveryEvent::DialFailed { daemon, standing, absent_at } => {
+                if let Some(address) = absent_at {
+                    self.peers.handle_absent(daemon, address);
+                }
                 self.peers.handle_dial_failed(now, daemon, standing);
             }
             DiscoveryEvent::GraphDigest(digest) => self.peers.set_graph(digest),

@@ -115,7 +115,8 @@ async fn two_daemons_find_each_other_by_multicast_and_part_with_a_goodbye() {
     let mut action = a.next().await;
     if let Some(DiscoveryAction::Dial { daemon, standing, .. }) = action {
         // The event overtook the datagram.
-        a.events.send(DiscoveryEvent::DialFailed { daemon, standing }).await.unwrap();
+        let failed = DiscoveryEvent::DialFailed { daemon, standing, absent_at: None };
+        a.events.send(failed).await.unwrap();
         action = a.next().await;
     }
     assert_eq!(action, Some(DiscoveryAction::Gone { daemon: b.id }));

@@ -124,8 +124,8 @@ impl Effects {
     pub(super) fn tell_report(&mut self, report: LinkReport) {
         match report {
             LinkReport::Refused(kind, peer, refusal) => self.tell_refused(kind, peer, refusal),
-            LinkReport::DialFailed { daemon, standing } => {
-                self.tell(ToControl::DialFailed { daemon, standing });
+            LinkReport::DialFailed { daemon, standing, absent_at } => {
+                self.tell(ToControl::DialFailed { daemon, standing, absent_at });
             }
             LinkReport::Up { daemon, address, proven } => {
                 self.tell(ToControl::LinkUp { daemon, address, proven });

@@ -148,7 +148,8 @@ impl Engine {
             ToGateway::Dial { daemon, sae, addresses, listed, standing } => {
                 // Discovery does not know yet that the peer has a link, or that its path works again.
                 if self.links.stands(daemon) {
-                    return self.effects.tell(ToControl::DialFailed { daemon, standing });
+                    let failed = ToControl::DialFailed { daemon, standing, absent_at: None };
+                    return self.effects.tell(failed);
                 }
                 let replaces = self.links.cut_link(daemon);
                 let (daemon, standing) = (Some(daemon), Some(standing));

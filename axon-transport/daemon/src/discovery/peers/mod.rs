@@ -4,6 +4,7 @@
 //! Any host can send a beacon, so a beacon is only a hint. Every collection is bounded, and every answer is
 //! rate-limited. No received datagram closes a link, or prevents a link to a peer that was acceptable before.
 
+mod absent;
 mod addresses;
 mod announcing;
 mod candidates;
@@ -260,9 +261,11 @@ impl PeerDiscovery {
         let listed = self.lists(address.ip().to_canonical());
         let address = SocketAddr::new(address.ip().to_canonical(), address.port());
         self.meet(address.ip());
+        self.handle_found(daemon, address);
         let record = self.records.entry(daemon).or_default();
         record.listed |= listed;
         record.linked = true;
+        record.linked_at = now;
         record.cut = false;
         record.leaving = None;
         record.last_seen = record.last_seen.max(now);
@@ -282,6 +285,8 @@ impl PeerDiscovery {
         (record.linked, record.cut) = (false, false);
         record.unproven = None;
         record.done();
+        self.forget_taken(daemon);
+        let Some(record) = self.records.get_mut(&daemon) else { return };
         let left = record.left(now);
         // A peer that dialled this host and whose beacons never arrived cannot be dialled.
         if !record.compatible {

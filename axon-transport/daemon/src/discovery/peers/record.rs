@@ -59,6 +59,8 @@ impl DialAddress {
 pub(super) struct DaemonRecord {
     /// The sources of beacons: by standing, and the latest first.
     pub(super) sources: Vec<DialAddress>,
+    /// The source that was removed last because another daemon is there: its name, if the peer links from there.
+    pub(super) removed: Option<DialAddress>,
     /// True if a beacon of it was acceptable; later unacceptable ones may be forged.
     pub(super) compatible: bool,
     /// True if this host lists it.
@@ -78,6 +80,8 @@ pub(super) struct DaemonRecord {
     /// Time at which it answered a probe after a goodbye in its name.
     pub(super) stayed: Option<Duration>,
     pub(super) linked: bool,
+    /// Time at which its latest link came up.
+    pub(super) linked_at: Duration,
     /// True if the path of its link is cut: the peer may have other addresses.
     pub(super) cut: bool,
     /// Set if the peer of the link did not prove that the id is its own: another host may have the id.
@@ -137,7 +141,8 @@ impl DaemonRecord {
             source.proven = source.address == address;
         }
         // A peer that cannot be dialled has no beacon, and none of its sources has a name.
-        if let (true, Some(first)) = (self.compatible, self.sources.first())
+        let first = self.sources.first().or(self.removed.as_ref());
+        if let (true, Some(first)) = (self.compatible, first)
             && !self.sources.iter().any(|source| source.proven)
         {
             let source = DialAddress { address, proven: true, known: true, ..first.clone() };
@@ -147,6 +152,17 @@ impl DaemonRecord {
             source.known = true;
         }
         self.order();
+    }
+
+    /// Removes an address at which another daemon is. The address of a link stays, because the link's peer proved that
+    /// it is there. The dial times stay, too: a beacon that repeats the address does not end the backoff.
+    pub(super) fn is_not_at(&mut self, address: SocketAddr) {
+        let linked = self.linked;
+        let gone = |s: &mut DialAddress| s.address == address && !(linked && s.proven);
+        self.removed = self.sources.extract_if(.., gone).last().or(self.removed.take());
+        for source in &mut self.sources {
+            source.advertised.retain(|advertised| *advertised != address);
+        }
     }
 
     /// Sorts the sources again. The sources of one standing displace no sources of another.

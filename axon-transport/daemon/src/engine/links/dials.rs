@@ -2,6 +2,7 @@
 
 use std::{
     collections::{HashMap, HashSet},
+    net::SocketAddr,
     time::Duration,
 };
 
@@ -141,9 +142,14 @@ impl Dials {
         self.opening.remove(&connection);
     }
 
-    /// Records that the opening of a connection failed. Returns the report if the connection was dialled.
-    pub(super) fn opening_failed(&mut self, connection: u64) -> Option<LinkReport> {
+    /// Records that the opening of a connection failed. Returns the report if the connection was dialled. `absent_at`:
+    /// the peer at this address is another daemon than the dialled one.
+    pub(super) fn opening_failed(
+        &mut self,
+        connection: u64,
+        absent_at: Option<SocketAddr>,
+    ) -> Option<LinkReport> {
         let (daemon, standing) = self.opening.remove(&connection)?;
-        Some(LinkReport::DialFailed { daemon, standing })
+        Some(LinkReport::DialFailed { daemon, standing, absent_at })
     }
 }

@@ -55,6 +55,7 @@ impl Links {
         // The other end compares, too. A peer that does not report a difference must not count as found.
         if let Some(expected) = link.expected.filter(|expected| *expected != daemon) {
             let why = format!("daemon id is {daemon} there, and {expected} was dialled");
+            self.opening_failed(number, Some(address));
             return self.turn_away(number, &hello, why, now);
         }
         let chain = connection.peer_chain();

@@ -1,6 +1,9 @@
 //! The ends of links: lost connections, protocol violations, and the shutdown of the daemon.
 
-use std::{net::IpAddr, time::Duration};
+use std::{
+    net::{IpAddr, SocketAddr},
+    time::Duration,
+};
 
 use quinn_proto::ConnectionError;
 
@@ -112,9 +115,10 @@ impl Links {
         self.end_link(number, why, None, now);
     }
 
-    /// Reports a dialled connection whose opening failed.
-    pub(super) fn opening_failed(&mut self, number: u64) {
-        if let Some(report) = self.dials.opening_failed(number) {
+    /// Reports a dialled connection whose opening failed. `absent_at`: the peer at this address is another daemon than
+    /// the dialled one.
+    pub(super) fn opening_failed(&mut self, number: u64, absent_at: Option<SocketAddr>) {
+        if let Some(report) = self.dials.opening_failed(number, absent_at) {
             self.outbox.report(report);
         }
     }
@@ -131,7 +135,7 @@ impl Links {
         if let Some(keyring) = &mut self.keyring {
             keyring.forget_connection(now, number);
         }
-        self.opening_failed(number);
+        self.opening_failed(number, None);
         self.connections.close(number, code, reason, instant);
     }
 

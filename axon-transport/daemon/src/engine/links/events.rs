@@ -54,8 +54,8 @@ pub(in crate::engine) enum LinkEvent {
 pub(in crate::engine) enum LinkReport {
     /// A link, or an attempt at one, was refused.
     Refused(RefusalKind, String, Refusal),
-    /// A dial failed.
-    DialFailed { daemon: DaemonId, standing: AddressConfidence },
+    /// A dial failed. If an authenticated peer answered that it is another daemon, `absent_at` is its address.
+    DialFailed { daemon: DaemonId, standing: AddressConfidence, absent_at: Option<SocketAddr> },
     /// A link of this daemon is up at this address. `proven` is true if the daemon proved its id.
     Up { daemon: DaemonId, address: SocketAddr, proven: bool },
     /// The path of this daemon's link fails, because probes of it were not answered, or works again.

@@ -20,7 +20,7 @@ use crate::{
             opening::{Handshake, Opening, RefusedConnection},
             target::DialTarget,
         },
-        refusal::Refusal,
+        refusal::{Refusal, RefusedBy},
     },
     keys::{self, Exporters},
     link::{CloseCode, LinkHello, Side},
@@ -188,8 +188,11 @@ impl Links {
         match link.side {
             Side::Server => self.refused_incoming(kind, address, link.resolver.as_deref(), refusal),
             Side::Client => {
+                // TLS authenticated the peer. It closes so if HELLO expected another daemon, or if it ends.
+                let is_gone =
+                    refusal.by == RefusedBy::Peer && refusal.name == CloseCode::Goodbye.name();
                 self.outbox.report(LinkReport::Refused(kind, peer_text(None, address), refusal));
-                self.opening_failed(number);
+                self.opening_failed(number, is_gone.then_some(address));
             }
         }
     }
@@ -249,7 +252,11 @@ impl Links {
                     let why = "the link that it was to succeed works again, or has a successor";
                     self.table.remove(number);
                     self.close_connection(number, CloseCode::Duplicate, why, now);
-                    return self.outbox.report(LinkReport::DialFailed { daemon, standing });
+                    return self.outbox.report(LinkReport::DialFailed {
+                        daemon,
+                        standing,
+                        absent_at: None,
+                    });
                 }
                 let current = target.daemon.and_then(|daemon| self.table.current_peer(daemon));
                 let in_use = current.and_then(|peer| Some(peer.elected?.link));
@@ -263,7 +270,7 @@ impl Links {
                 self.dials.note_opening(number, target.daemon.zip(target.standing));
                 self.begin_opening(number, hello, sae, now);
                 if !self.table.contains(number) {
-                    self.opening_failed(number);
+                    self.opening_failed(number, None);
                 }
             }
             DialAction::Failed(refusal) => {
@@ -279,7 +286,11 @@ impl Links {
                 };
                 self.outbox.report(LinkReport::Refused(kind, target.text(), refusal));
                 if let (Some(daemon), Some(standing)) = (target.daemon, target.standing) {
-                    self.outbox.report(LinkReport::DialFailed { daemon, standing });
+                    self.outbox.report(LinkReport::DialFailed {
+                        daemon,
+                        standing,
+                        absent_at: None,
+                    });
                 }
             }
         }

@@ -22,6 +22,7 @@ use quinn_proto::{EcnCodepoint, Transmit};
 use rand::RngExt;
 
 use super::{
+    beacons::{BeaconDiscovery, MOST_BEACON_DIALS},
     discovery::SimDiscovery,
     rings::{SimRings, session_key},
     rng::{Stream, stream},
@@ -29,7 +30,7 @@ use super::{
 use crate::{
     bridge::{ToControl, ToGateway, TrafficRules},
     daemon_key::DaemonKey,
-    discovery::Interface,
+    discovery::{Arrival, Interface},
     engine::{
         Effect, Engine, EngineParts,
         compression::{CompressionAnswer, Compressor},
@@ -69,6 +70,8 @@ pub(super) struct Host {
     seed: u64,
     starts: u32,
     discovery: SimDiscovery,
+    /// The daemon's own discovery, in scenarios about dials.
+    beacons: Option<BeaconDiscovery>,
     /// The endpoints of each peer, as reported to the control plane.
     pub(super) graph: BTreeMap<DaemonId, BTreeMap<Gid, RemoteEndpoint>>,
     pub(super) status: BTreeMap<String, LinkStatus>,
@@ -113,6 +116,7 @@ impl Host {
             seed,
             starts: 0,
             discovery: SimDiscovery::default(),
+            beacons: None,
             graph: BTreeMap::new(),
             status: BTreeMap::new(),
             refusals: VecDeque::new(),
@@ -188,6 +192,9 @@ impl Host {
         self.compressed.clear();
         self.status.clear();
         self.discovery.start(self.daemon, now);
+        if self.beacons.is_some() {
+            self.use_beacons(now);
+        }
         self.graph_changed = true;
     }
 
@@ -231,6 +238,18 @@ impl Host {
         }
     }
 
+    /// Makes the host find its peers by beacons from now on, with the daemon's own discovery.
+    pub(super) fn use_beacons(&mut self, now: Duration) {
+        self.due.set(None);
+        let address = IpAddr::V4(self.address);
+        self.beacons = Some(BeaconDiscovery::new(&self.config, self.daemon, address, now));
+    }
+
+    /// Returns the number of dials that discovery ordered since the daemon's start, if the host uses beacons.
+    pub(super) fn dials(&self) -> u64 {
+        self.beacons.as_ref().map_or(0, |beacons| beacons.dials)
+    }
+
     /// Makes the host link with a peer. The lower id dials.
     pub(super) fn want(
         &mut self,
@@ -240,7 +259,11 @@ impl Host {
         now: Duration,
     ) {
         self.due.set(None);
-        self.discovery.want(daemon, SocketAddr::from((address, PORT)), sae, now);
+        let address = SocketAddr::from((address, PORT));
+        match &mut self.beacons {
+            Some(beacons) => beacons.hear(now, daemon, address, sae),
+            None => self.discovery.want(daemon, address, sae, now),
+        }
     }
 
     /// Forgets a peer that is gone.
@@ -304,7 +327,8 @@ impl Host {
 
     /// Checks that the host holds no more than it may.
     pub(super) fn check_held(&mut self, now: Duration) {
-        let dials = self.discovery.most_dials(now);
+        let of_beacons = if self.beacons.is_some() { MOST_BEACON_DIALS } else { 0 };
+        let dials = self.discovery.most_dials(now) + of_beacons;
         if let Some(engine) = &self.engine {
             super::held::check(engine, self.config.reliable_queue as usize, dials);
         }
@@ -399,7 +423,9 @@ impl Host {
             (came || self.interfaces_asked || !self.records.is_empty()).then_some(now)
         };
         let compressed = self.compressed.front().map(|(due, _)| *due);
-        let parts = [engine.poll_timeout(now), ready, compressed, self.discovery.poll_timeout()];
+        let beacons = self.beacons.as_ref().and_then(|beacons| beacons.peers.poll_timeout());
+        let discovery = [self.discovery.poll_timeout(), beacons].into_iter().flatten().min();
+        let parts = [engine.poll_timeout(now), ready, compressed, discovery];
         parts.into_iter().flatten().min()
     }
 
@@ -439,8 +465,10 @@ impl Host {
             let first = self.used.insert(key_id);
             engine.handle_recorded(now, link, first);
         }
-        for dial in self.discovery.take_due(now) {
-            engine.handle_order(now, dial);
+        let ordered = self.beacons.iter_mut().flat_map(|beacons| beacons.take_orders(now));
+        let ordered: Vec<_> = self.discovery.take_due(now).into_iter().chain(ordered).collect();
+        for order in ordered {
+            engine.handle_order(now, order);
         }
         if engine.poll_timeout(now).is_some_and(|due| due <= now) {
             engine.handle_timeout(now);
@@ -488,17 +516,31 @@ impl Host {
                 self.graph.remove(&daemon);
                 self.refusals.push_back((now, "silent".into()));
             }
-            ToControl::LinkUp { daemon, address, .. } => {
+            ToControl::LinkUp { daemon, address, proven } => {
                 self.discovery.handle_link_up(daemon, address);
+                if let Some(beacons) = &mut self.beacons {
+                    beacons.peers.handle_link_up(now, daemon, address, proven);
+                }
             }
-            ToControl::Path { daemon, works } => self.discovery.handle_path(now, daemon, works),
+            ToControl::Path { daemon, works } => {
+                self.discovery.handle_path(now, daemon, works);
+                if let Some(beacons) = &mut self.beacons {
+                    beacons.peers.handle_path(now, daemon, works);
+                }
+            }
             ToControl::LinkDown { daemon, reason } => {
                 self.graph.remove(&daemon);
                 self.refusals.push_back((now, format!("down: {reason}")));
                 self.discovery.handle_link_down(now, daemon);
+                if let Some(beacons) = &mut self.beacons {
+                    beacons.peers.handle_link_down(now, daemon);
+                }
             }
-            ToControl::DialFailed { daemon, .. } => {
+            ToControl::DialFailed { daemon, standing, absent_at } => {
                 self.discovery.handle_dial_failed(now, daemon);
+                if let Some(beacons) = &mut self.beacons {
+                    beacons.handle_dial_failed(now, daemon, standing, absent_at);
+                }
             }
             ToControl::Refusal { peer, what, reason, .. } => {
                 self.refusals.push_back((now, format!("{peer}: {what}: {reason}")));
@@ -506,10 +548,12 @@ impl Host {
             ToControl::Lost { topic, cause, samples } => {
                 *self.lost.entry((topic, cause)).or_default() += samples;
             }
-            // Answers a probe as the control plane does. There are no beacons.
+            // Answers a probe as the control plane does.
             ToControl::Datagrams(datagrams) => {
                 for (to, bytes) in datagrams.iter() {
-                    if let (Ok(Datagram::Probe { nonce, .. }), Some(engine)) =
+                    if let Some(beacons) = &mut self.beacons {
+                        beacons.peers.handle_datagram(now, to, Arrival::Quic, bytes);
+                    } else if let (Ok(Datagram::Probe { nonce, .. }), Some(engine)) =
                         (Datagram::decode(bytes), &mut self.engine)
                     {
                         let bytes = Datagram::Echo { daemon: self.daemon, nonce }.encode();

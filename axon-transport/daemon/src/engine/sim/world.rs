@@ -70,6 +70,14 @@ impl World {
         world
     }
 
+    /// Creates hosts like [`new`](Self::new). They find each other by beacons.
+    pub(super) fn with_beacons(seed: u64, hosts: usize, config: impl Fn(usize) -> Config) -> Self {
+        let mut world = Self::apart(seed, hosts, config);
+        world.hosts.iter_mut().for_each(|host| host.use_beacons(Duration::ZERO));
+        (0..hosts).for_each(|host| world.introduce(host));
+        world
+    }
+
     /// Creates hosts like [`new`](Self::new), but no host dials.
     pub(super) fn apart(seed: u64, hosts: usize, config: impl Fn(usize) -> Config) -> Self {
         let epoch = Instant::now();

@@ -1,5 +1,6 @@
 //! Tests one state machine with hand-made events.
 
+mod absent;
 mod claims;
 mod flood;
 mod goodbye;

@@ -130,7 +130,7 @@ impl Links {
         if !is_beside || is_older || self.has_path_in_use(number, daemon) {
             // The link in use changed meanwhile, or messages on two connections overtook each other.
             self.end_standby(number, "the link beside it changed", now);
-            return self.opening_failed(number);
+            return self.opening_failed(number, None);
         }
         let sealing = self.table.peer(number).and_then(|peer| peer.sealing.as_ref());
         if let (Some(keyring), Some(Sealing { exporters, .. })) = (&mut self.keyring, sealing)

@@ -12,7 +12,7 @@ use axon_transport::config::{Config, KeyMode, Security};
 use crate::engine::keyring::tests::config as qkd;
 use crate::engine::sim::{
     network::{Path, Rate},
-    tests::{all_cases, millis, modes, secs},
+    tests::{all_cases, classic, millis, modes, secs},
     world::{Pair, World},
 };
 
@@ -162,4 +162,64 @@ fn keep_all_outlasts_a_killed_daemon_of_the_subscription() {
             assert!(received.into_iter().eq(1..=published), "{case}: {}", world.describe());
         }
     }
+}
+
+/// Returns the numbers of ordered dials and of calls to the KMEs.
+fn costs(world: &World) -> (u64, usize) {
+    (world.hosts[0].dials(), world.kmes.asked.len())
+}
+
+#[test]
+fn daemons_that_had_successors_at_their_address_are_not_dialled_again_and_again() {
+    for (mode, config) in modes() {
+        let mut world = World::with_beacons(91, 2, &config);
+        world.until(secs(10), World::is_linked);
+        let (first_dials, first_asked) = costs(&world);
+        for succession in 1..=20 {
+            world.run_for(secs(2));
+            world.kill(1, false);
+            world.run_for(millis(100 * (succession % 4)));
+            let (dials_before, asked_before) = costs(&world);
+            world.restart(1);
+            world.until(secs(20), World::is_linked);
+            world.run_for(secs(2));
+            let (dials, asked) = costs(&world);
+            let case = format!("{mode}, {succession}: {dials} dials, {asked} KME calls");
+            // One dial of the new daemon, and one of the daemon before it.
+            assert!(
+                dials <= dials_before + 2,
+                "{case}, {dials_before} before: {}",
+                world.describe()
+            );
+            if mode == "session" {
+                let most = 3 * (first_asked + 4);
+                assert!(asked <= asked_before + most, "{case}, {asked_before} before");
+            }
+        }
+        let before = costs(&world);
+        world.run_for(secs(20));
+        println!("{mode}: {first_dials} and {first_asked} for the first link, {before:?} in all");
+        let after = costs(&world);
+        assert_eq!(after.0, before.0, "{mode}: nobody is dialled once all is quiet");
+        assert!(mode == "messages10" || after.1 == before.1, "{mode}: {after:?}, {before:?}");
+    }
+}
+
+#[test]
+fn a_host_that_claims_the_id_of_another_one_ends_no_dials_to_that_one() {
+    let mut world = World::with_beacons(92, 3, classic);
+    let honest = world.hosts[1].daemon;
+    world.until(secs(10), World::is_linked);
+    // Beacons of the liar name the honest daemon, whose path is cut meanwhile.
+    let cuts = [(0, 1), (1, 0)].map(|(from, to)| world.network.cut(&[from], &[to], None));
+    world.run_for(secs(150));
+    assert!(!world.hosts[0].linked().contains(&honest));
+    for _ in 0..40 {
+        let liar = world.hosts[2].address;
+        world.hosts[0].want(honest, liar, None, world.now);
+        world.tell(0, 1);
+        world.run_for(secs(1));
+    }
+    cuts.into_iter().for_each(|cut| world.network.heal(cut));
+    world.until(secs(20), World::is_linked);
 }
