@@ -39,10 +39,21 @@ struct KeptRelay {
     unfinished: Rc<UnfinishedFlows>,
     since: Duration,
     until: Duration,
-    /// One charge as a kept relay, and one that still counts it among the identity's relays.
-    _charges: [Charge; 2],
+    /// The charge as a kept relay.
+    _room: Charge,
+    /// The charge that still counts it among the identity's relays.
+    place: Charge,
     /// The charge for the relay's lanes.
     lanes: Charge,
+}
+
+/// The reason why a relay is not charged.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum NotCharged {
+    /// The identity, or all together, have as many relays as they may.
+    Relays,
+    /// The lanes do not fit.
+    Lanes,
 }
 
 impl KeptRelay {
@@ -101,7 +112,7 @@ impl KeptRelays {
         for source in sources {
             let Source::Relay(spec, reader) = source else { continue };
             let Some(place) = room.charge(1) else { continue };
-            let charges = [place, served.relays.split(1)];
+            let (kept_room, place) = (place, served.relays.split(1));
             let identity = identity.to_owned();
             let (key, since, until) = (served.key.clone(), now, now + RELAY_RETENTION);
             let unfinished = Rc::clone(&unfinished);
@@ -114,32 +125,37 @@ impl KeptRelays {
                 unfinished,
                 since,
                 until,
-                _charges: charges,
+                _room: kept_room,
+                place,
                 lanes,
             });
         }
     }
 
-    /// Charges `many` lanes for a new relay. If the peer is about to adopt a kept relay, the lanes of that
-    /// one are released to make room. The kept relay then has no lanes, so [`adopt`](Self::adopt) must
-    /// follow. Returns `None` if the lanes do not fit; the kept relay then keeps its charge.
-    pub(super) fn charge_lanes(
+    /// Charges a place and `many` lanes for a new relay, each to the meter of the route's charge. If the peer is about to
+    /// adopt a kept relay, the place and the lanes of that one are released to make room. The kept relay then has none,
+    /// so [`adopt`](Self::adopt) must follow.
+    ///
+    /// # Errors
+    /// The place or the lanes do not fit. The kept relay then keeps its charges.
+    pub(super) fn charge(
         &mut self,
         key: &RouteKey,
         spec: &RelaySpec,
         identity: &str,
-        lanes: &Charge,
+        (places, lanes): (&Charge, &Charge),
         many: usize,
-    ) -> Option<Charge> {
+    ) -> Result<(Charge, Charge), NotCharged> {
         let Some(kept) = self.all.iter_mut().find(|kept| kept.fits(key, spec, identity)) else {
-            return lanes.more(many);
+            let place = places.more(1).ok_or(NotCharged::Relays)?;
+            return Ok((place, lanes.more(many).ok_or(NotCharged::Lanes)?));
         };
-        let before = std::mem::replace(&mut kept.lanes, lanes.meter().nothing());
-        match before.exchange(lanes.meter(), many) {
-            Ok(charged) => Some(charged),
-            Err(before) => {
-                kept.lanes = before;
-                None
+        let place = exchange(&mut kept.place, places, 1).ok_or(NotCharged::Relays)?;
+        match exchange(&mut kept.lanes, lanes, many) {
+            Some(lanes) => Ok((place, lanes)),
+            None => {
+                kept.place = place;
+                Err(NotCharged::Lanes)
             }
         }
     }
@@ -194,5 +210,101 @@ impl KeptRelays {
             }
         }
         lost
+    }
+}
+
+/// Exchanges a charge of a kept relay for one of `amount` of the other charge's meter. Returns `None` if that does not
+/// fit; the kept relay then keeps its charge.
+fn exchange(kept: &mut Charge, to: &Charge, amount: usize) -> Option<Charge> {
+    let before = std::mem::replace(kept, to.meter().nothing());
+    match before.exchange(to.meter(), amount) {
+        Ok(charged) => Some(charged),
+        Err(before) => {
+            *kept = before;
+            None
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use axon_envelope::Kind;
+    use axon_shm::{ids::Gid, qos::Qos};
+    use axon_transport::EndpointSpec;
+
+    use super::*;
+    use crate::engine::{rings::Rings, sim::rings::SimRings};
+
+    const IDENTITY: &str = "robot";
+
+    fn key() -> RouteKey {
+        RouteKey { kind: Kind::Topic, topic: "/t".into(), type_name: "t".into() }
+    }
+
+    fn spec() -> RelaySpec {
+        let stands_for = vec![Gid([1; 16])];
+        RelaySpec { qos: Qos::keep_all(), depth: 0, type_hash: Vec::new(), stands_for }
+    }
+
+    /// Returns kept relays with one whose place is of `places` and whose two lanes are of `lanes`.
+    fn kept(places: &Rc<Meter>, lanes: &Rc<Meter>) -> KeptRelays {
+        let mut kept = KeptRelays::default();
+        let room = kept.room_of(IDENTITY).charge(1).unwrap();
+        let endpoint = EndpointSpec::new("/t", "t", Qos::keep_all());
+        let reader = SimRings::new(0).open_reader(endpoint, spec().stands_for).unwrap();
+        kept.all.push(KeptRelay {
+            identity: IDENTITY.into(),
+            key: key(),
+            spec: spec(),
+            reader,
+            unfinished: Rc::default(),
+            since: Duration::ZERO,
+            until: RELAY_RETENTION,
+            _room: room,
+            place: places.charge(1).unwrap(),
+            lanes: lanes.charge(2).unwrap(),
+        });
+        kept
+    }
+
+    fn charge(
+        kept: &mut KeptRelays,
+        identity: &str,
+        (places, lanes): (&Rc<Meter>, &Rc<Meter>),
+    ) -> Result<(Charge, Charge), NotCharged> {
+        kept.charge(&key(), &spec(), identity, (&places.nothing(), &lanes.nothing()), 2)
+    }
+
+    #[test]
+    fn a_peer_with_as_many_relays_as_it_may_have_adopts_its_kept_one() {
+        let (places, lanes) = (Meter::new(1), Meter::new(2));
+        let mut kept = kept(&places, &lanes);
+        let charged = charge(&mut kept, IDENTITY, (&places, &lanes)).unwrap();
+        assert!(kept.adopt(&key(), &spec(), IDENTITY, Duration::ZERO, Duration::ZERO).is_some());
+        assert_eq!((places.held(), lanes.held()), (1, 2), "it counts once");
+        drop(charged);
+        assert_eq!((places.held(), lanes.held()), (0, 0));
+    }
+
+    #[test]
+    fn a_kept_relay_makes_no_room_for_another_identity() {
+        let (places, lanes) = (Meter::new(1), Meter::new(2));
+        let mut kept = kept(&places, &lanes);
+        let refused = charge(&mut kept, "other", (&places, &lanes)).unwrap_err();
+        assert_eq!(refused, NotCharged::Relays);
+        assert_eq!((places.held(), lanes.held()), (1, 2));
+    }
+
+    #[test]
+    fn a_kept_relay_keeps_its_charges_if_the_new_one_does_not_fit() {
+        let (places, lanes) = (Meter::new(1), Meter::new(2));
+        let mut kept = kept(&places, &lanes);
+        let (none, one) = (Meter::new(0), Meter::new(1));
+        let no_place = charge(&mut kept, IDENTITY, (&none, &lanes)).unwrap_err();
+        let no_lanes = charge(&mut kept, IDENTITY, (&places, &one)).unwrap_err();
+        assert_eq!([no_place, no_lanes], [NotCharged::Relays, NotCharged::Lanes]);
+        assert_eq!((places.held(), lanes.held(), one.held()), (1, 2, 0));
+        assert_eq!(kept.give_up(RELAY_RETENTION), []);
+        assert_eq!((places.held(), lanes.held()), (0, 0));
     }
 }

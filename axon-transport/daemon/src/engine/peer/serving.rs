@@ -7,7 +7,9 @@ use axon_shm::ids::Gid;
 use axon_transport::EndpointSpec;
 
 use super::{
-    Peer, PeerContext, reader_of,
+    Peer, PeerContext,
+    kept_relays::NotCharged,
+    reader_of,
     routes::{
         refused::TOO_MANY_LANES,
         served::{DENIED_AGAIN, MAX_ROUTES, MissingRelay, ServedRoute, StalledRoute},
@@ -29,6 +31,8 @@ const ASK_AGAIN: Duration = Duration::from_secs(10);
 /// Memory of a route, in bytes, beside the names and subscribers of which it holds three copies.
 const ROUTE_BYTES: usize = 2048;
 const NAME_COPIES: usize = 3;
+const TOO_MANY_RELAYS: &str = "this host has as many relays as a peer may have, or all peers";
+
 /// The relays of a route.
 struct Relays {
     sources: Vec<Source>,
@@ -277,16 +281,19 @@ impl Peer {
                 continue;
             }
             // A kept relay stays kept if there is no place for it.
-            let Some(place) = self.remote.account().relays.charge(1) else {
-                let why = "this host has as many relays as a peer may have, or all peers";
-                without = Some((why.to_owned(), Some(ASK_AGAIN)));
-                continue;
-            };
             let mut relays_kept = with.kept.borrow_mut();
             let own = &self.identity;
-            let Some(its_lanes) = relays_kept.charge_lanes(key, &spec, own, lanes, each) else {
-                without = Some((TOO_MANY_LANES.to_owned(), Some(ASK_AGAIN)));
-                continue;
+            let charged = relays_kept.charge(key, &spec, own, (&*places, &*lanes), each);
+            let (place, its_lanes) = match charged {
+                Ok(charged) => charged,
+                Err(lacks) => {
+                    let why = match lacks {
+                        NotCharged::Relays => TOO_MANY_RELAYS,
+                        NotCharged::Lanes => TOO_MANY_LANES,
+                    };
+                    without = Some((why.to_owned(), Some(ASK_AGAIN)));
+                    continue;
+                }
             };
             let limit = with.config.link.stalled;
             let kept = relays_kept.adopt(key, &spec, own, limit, now);

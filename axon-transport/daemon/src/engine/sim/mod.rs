@@ -14,7 +14,7 @@ mod host;
 pub(crate) mod network;
 pub(crate) mod pair;
 mod raw;
-mod rings;
+pub(crate) mod rings;
 pub(crate) mod rng;
 mod run;
 mod scenarios;

@@ -94,7 +94,7 @@ struct Cursors {
 
 /// The rings of one host. Clones share them.
 #[derive(Clone)]
-pub(super) struct SimRings {
+pub(crate) struct SimRings {
     session: SessionId,
     key: Arc<SessionKey>,
     state: Rc<RefCell<State>>,
@@ -148,7 +148,7 @@ fn payload_of(publisher: &Endpoint, sequence: u64, length: usize) -> Vec<u8> {
 
 impl SimRings {
     /// Creates the rings of a host whose sessions have this number.
-    pub(super) fn new(host: usize) -> Self {
+    pub(crate) fn new(host: usize) -> Self {
         let mut seed = [0x51; 32];
         seed[24..].copy_from_slice(&(host as u64).to_be_bytes());
         let key = Arc::new(session_key(&seed));
