@@ -13,8 +13,9 @@ use axon_shm::{
 };
 use axon_transport::{
     access::Verb,
+    config::DiscoveryRange,
     graph::{Endpoint, EndpointKind},
-    internal::graph::verb_of,
+    internal::graph::{RangeToHost, out_of_range, verb_of},
 };
 
 use super::{
@@ -36,6 +37,9 @@ use crate::{
     },
     link::{LinkMessage, RouteRefused, RouteSubscriber, Unsubscribe},
 };
+
+/// The widest range of a publisher or client that may come, unless its session lists this host.
+const SUBNET: RangeToHost = RangeToHost { range: DiscoveryRange::Subnet, lists: false };
 
 impl Peer {
     /// Asks for the routes that follow from the graphs of both hosts.
@@ -68,7 +72,8 @@ impl Peer {
 
     /// Adds the routes that were asked for earlier, and their subscriptions or servers, as long as these exist here. A
     /// publisher or client may have come to the peer's host that is not in the peer's graph here yet. It is matched there
-    /// because the peer still serves the route, so the route must not end because the one before it left.
+    /// because the peer still serves the route, so the route must not end because the one before it left. A subscription
+    /// or server whose range has no publisher or client of a SUBNET session any more is left out.
     fn keep_asked(&self, wanted: &mut BTreeMap<RouteKey, WantedRoute>, with: &PeerContext<'_>) {
         let most = self.asked.most();
         // A route that is not needed now may take the place of one that is.
@@ -77,7 +82,8 @@ impl Peer {
             let before = wanted.get(key);
             let lacks = |reader: &&RouteSubscriber| {
                 let is_wanted = before.is_some_and(|route| route.has_reader(&reader.gid));
-                !is_wanted && with.local.contains_key(&reader.gid)
+                let own = with.local.get(&reader.gid).map(|(_, range)| range.toward(self.daemon));
+                !is_wanted && own.is_some_and(|own| out_of_range(own, SUBNET).is_none())
             };
             let readers: Vec<_> = asked.wanted.subscribers.iter().filter(lacks).cloned().collect();
             let has_room = before.is_some()

@@ -488,6 +488,12 @@ impl Peer {
         self.refused.held()
     }
 
+    /// Returns the number of routes that the peer is served.
+    #[cfg(test)]
+    pub(super) fn served_routes(&self) -> usize {
+        self.served.len()
+    }
+
     /// Counts the publishers, servers and clients of the peer that are shown here.
     #[cfg(test)]
     pub(super) fn stand_ins(&self) -> usize {

@@ -88,6 +88,8 @@ pub(super) struct Host {
     pub(super) compressions: u64,
     used: BTreeSet<String>,
     graph_changed: bool,
+    /// The range of all sessions.
+    range: DiscoveryRange,
     /// Questions about the access rules of peers, as orders.
     questions: Vec<ToGateway>,
     /// The answers, by number.
@@ -128,6 +130,7 @@ impl Host {
             compressions: 0,
             used: BTreeSet::new(),
             graph_changed: false,
+            range: DiscoveryRange::Subnet,
             questions: Vec::new(),
             decisions: BTreeMap::new(),
             rules: None,
@@ -353,6 +356,18 @@ impl Host {
         self.graph_changed = true;
     }
 
+    /// Sets the range of all sessions.
+    pub(super) fn set_range(&mut self, range: DiscoveryRange) {
+        self.range = range;
+        self.touch_graph();
+    }
+
+    /// Returns the number of routes that all peers are served.
+    pub(super) fn served_routes(&self) -> usize {
+        let peers = self.engine.iter().flat_map(|engine| engine.peers.iter());
+        peers.map(|(_, peer)| peer.served_routes()).sum()
+    }
+
     /// Sets other access rules.
     pub(super) fn set_access(&mut self, rules: &str) {
         let access = AccessRules::parse(rules, "access.toml").unwrap();
@@ -434,7 +449,7 @@ impl Host {
         self.due.set(None);
         let Some(engine) = &mut self.engine else { return };
         if std::mem::take(&mut self.graph_changed) {
-            let range = EndpointRange { range: DiscoveryRange::Subnet, lists: Vec::new() };
+            let range = EndpointRange { range: self.range, lists: Vec::new() };
             let endpoints = self.rings.endpoints().into_iter();
             let local = endpoints.map(|e| (e.gid, (e, range.clone()))).collect();
             engine.handle_local_graph(now, local);

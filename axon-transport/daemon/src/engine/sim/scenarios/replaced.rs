@@ -1,10 +1,12 @@
-//! The last publisher of a topic ends, and another one of the same host comes soon after.
+//! The last publisher of a topic ends, and another one of the same host comes soon after, or its subscription is out of
+//! range meanwhile.
 
 use axon_shm::qos::Qos;
+use axon_transport::config::DiscoveryRange;
 
 use crate::engine::sim::{
     network::Path,
-    tests::{millis, modes, secs},
+    tests::{classic, millis, modes, secs},
     world::{Pair, World},
 };
 
@@ -35,5 +37,24 @@ fn no_sample_of_a_new_publisher_is_lost_with_the_route_of_the_one_before() {
             assert_eq!(world.received(pair), promised, "{mode}, {pause} ms: {given_up} given up");
             before = publisher;
         }
+    }
+}
+
+#[test]
+fn a_route_without_a_publisher_ends_when_its_subscription_is_out_of_range() {
+    for (denies, most) in [(false, 1), (true, 0)] {
+        let mut world = World::new(93, 2, classic);
+        let pair = world.pair(0, 1, "/topic", Qos::keep_all());
+        world.until(secs(20), World::is_whole);
+        world.run_for(secs(1));
+        world.hosts[0].rings.end(pair.publisher.1);
+        world.hosts[0].touch_graph();
+        world.run_for(secs(3));
+        assert_eq!(world.hosts[0].served_routes(), 1, "the next publisher needs it");
+        if denies {
+            world.hosts[1].set_range(DiscoveryRange::Localhost);
+        }
+        world.run_for(secs(3));
+        assert_eq!(world.hosts[0].served_routes(), most, "{denies}: {}", world.describe());
     }
 }
