@@ -180,9 +180,14 @@ impl LinkedPeers {
         self.kept.borrow().len()
     }
 
-    /// Gives up the samples of kept relays whose time is over. Returns the samples, by topic.
+    /// Gives up the samples of kept relays whose time is over. Returns the samples, by topic, that a subscription misses
+    /// or may miss.
     pub(super) fn give_up_relays(&mut self, now: Duration) -> Vec<(String, u64)> {
-        self.kept.borrow_mut().give_up(now)
+        let have_ended = |identity: &str, subscriptions: &[Gid]| {
+            let mut peers = self.all.values().filter(|peer| peer.has_identity(identity)).peekable();
+            peers.peek().is_some() && peers.all(|peer| peer.remote.lacks(subscriptions))
+        };
+        self.kept.borrow_mut().give_up(now, have_ended)
     }
 
     /// Returns whether samples of ended publishers are still being sent.

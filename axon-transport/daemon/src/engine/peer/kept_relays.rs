@@ -7,6 +7,8 @@ use std::{
     time::Duration,
 };
 
+use axon_shm::ids::Gid;
+
 use super::routes::served::{ServedRoute, ServedRoutes};
 use crate::engine::route::{RelaySpec, RouteKey};
 use crate::engine::{
@@ -196,10 +198,19 @@ impl KeptRelays {
         self.all.iter().map(|kept| kept.until).min()
     }
 
-    /// Gives up the samples of the relays whose time is over. Returns the samples by topic.
-    pub(crate) fn give_up(&mut self, now: Duration) -> Vec<(String, u64)> {
+    /// Gives up the samples of the relays whose time is over. Returns the samples by topic. `have_ended` returns whether
+    /// these subscriptions of the host with this identity have ended: nobody misses their samples, so they do not count.
+    pub(crate) fn give_up(
+        &mut self,
+        now: Duration,
+        have_ended: impl Fn(&str, &[Gid]) -> bool,
+    ) -> Vec<(String, u64)> {
         let mut lost = Vec::new();
-        for KeptRelay { key, reader, .. } in self.all.extract_if(.., |kept| kept.until <= now) {
+        for kept in self.all.extract_if(.., |kept| kept.until <= now) {
+            let KeptRelay { identity, key, spec, reader, .. } = kept;
+            if have_ended(&identity, &spec.stands_for) {
+                continue;
+            }
             let mut all = 0;
             for (publisher, samples) in reader.unacknowledged() {
                 reader.give_up(publisher, samples);
@@ -229,7 +240,7 @@ fn exchange(kept: &mut Charge, to: &Charge, amount: usize) -> Option<Charge> {
 #[cfg(test)]
 mod tests {
     use axon_envelope::Kind;
-    use axon_shm::{ids::Gid, qos::Qos};
+    use axon_shm::qos::Qos;
     use axon_transport::EndpointSpec;
 
     use super::*;
@@ -304,7 +315,7 @@ mod tests {
         let no_lanes = charge(&mut kept, IDENTITY, (&places, &one)).unwrap_err();
         assert_eq!([no_place, no_lanes], [NotCharged::Relays, NotCharged::Lanes]);
         assert_eq!((places.held(), lanes.held(), one.held()), (1, 2, 0));
-        assert_eq!(kept.give_up(RELAY_RETENTION), []);
+        assert_eq!(kept.give_up(RELAY_RETENTION, |_, _| false), []);
         assert_eq!((places.held(), lanes.held()), (0, 0));
     }
 }

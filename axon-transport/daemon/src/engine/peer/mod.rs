@@ -440,6 +440,11 @@ impl Peer {
         }
     }
 
+    /// Returns whether the peer proved this identity.
+    pub(super) fn has_identity(&self, identity: &str) -> bool {
+        self.identity == identity
+    }
+
     /// Keeps the KEEP_ALL relays of the peer, which is gone, for its next daemon.
     pub(super) fn keep_relays(&mut self, kept: &mut KeptRelays, now: Duration) {
         kept.add(&self.identity, &mut self.served, &mut self.outbound, now);

@@ -266,6 +266,12 @@ impl PeerGraph {
         self.left_out.count()
     }
 
+    /// Returns whether the peer sent its whole graph, and none of these endpoints is in it.
+    pub(crate) fn lacks(&self, endpoints: &[Gid]) -> bool {
+        let is_whole = self.version > 0 && self.gathered.is_none() && self.left_out() == 0;
+        is_whole && !endpoints.iter().any(|gid| self.all.contains_key(gid))
+    }
+
     /// Returns whether there is room now for the first left-out endpoint, so that the whole graph is worth
     /// requesting.
     pub(crate) fn has_room_again(&self) -> bool {

@@ -214,7 +214,7 @@ impl Host {
     /// Kills the daemon: it sends nothing more, and its state is gone.
     pub(super) fn kill(&mut self) {
         self.due.set(None);
-        self.engine = None;
+        self.rings.kill(|| self.engine = None);
         self.discovery.kill();
         self.graph.clear();
     }

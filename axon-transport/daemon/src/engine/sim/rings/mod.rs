@@ -77,6 +77,8 @@ struct State {
     waits_for_room: bool,
     /// No relay and no stand-in can be opened.
     fails: bool,
+    /// The daemon's process is ending without a word.
+    is_killed: bool,
 }
 
 /// The positions up to which a relay has read and acknowledged each publisher.
@@ -266,6 +268,14 @@ impl SimRings {
     /// Sets whether opening a relay or stand-in fails from now on.
     pub(super) fn set_fails(&self, fails: bool) {
         self.state.borrow_mut().fails = fails;
+    }
+
+    /// Ends the daemon's process, in which `end` drops the relays. Publishers give up what these did not acknowledge, as
+    /// nobody will: they find a dead process. A relay that a living daemon drops reports its losses itself.
+    pub(super) fn kill(&self, end: impl FnOnce()) {
+        self.state.borrow_mut().is_killed = true;
+        end();
+        self.state.borrow_mut().is_killed = false;
     }
 
     /// Returns the endpoints that the host shows.

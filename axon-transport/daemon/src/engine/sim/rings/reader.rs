@@ -24,8 +24,8 @@ pub(super) struct SimReader {
 impl Drop for SimReader {
     fn drop(&mut self) {
         self.cursors.closed.set(true);
-        // A relay that ends gives up its unacknowledged samples.
-        if self.cursors.spec.qos.reliability == Reliability::Reliable {
+        let is_killed = self.rings.state.borrow().is_killed;
+        if is_killed && self.cursors.spec.qos.reliability == Reliability::Reliable {
             for (publisher, samples) in self.unacknowledged() {
                 self.give_up(publisher, samples);
             }

@@ -1,5 +1,5 @@
 //! The last publisher of a topic ends, and another one of the same host comes soon after, or its subscription is out of
-//! range meanwhile.
+//! range meanwhile. A subscription ends at the same time as its daemon.
 
 use axon_shm::qos::Qos;
 use axon_transport::config::DiscoveryRange;
@@ -56,5 +56,38 @@ fn a_route_without_a_publisher_ends_when_its_subscription_is_out_of_range() {
         }
         world.run_for(secs(3));
         assert_eq!(world.hosts[0].served_routes(), most, "{denies}: {}", world.describe());
+    }
+}
+
+#[test]
+fn samples_for_a_subscription_that_ended_with_its_daemon_are_not_lost() {
+    for (mode, config) in modes() {
+        for ends in [true, false] {
+            let mut world = World::new(94, 2, &config);
+            let pair = world.pair(0, 1, "/topic", Qos::keep_all());
+            let other = world.pair(0, 1, "/other", Qos::keep_all());
+            world.until(secs(20), World::is_whole);
+            world.run_for(secs(1));
+            world.network.partition(&[1], None);
+            for _ in 0..20 {
+                assert!(world.publish(pair, 100) && world.publish(other, 100));
+                world.run_for(millis(10));
+            }
+            if ends {
+                world.hosts[1].rings.end(pair.subscription.1);
+            }
+            world.kill(1, false);
+            world.run_for(secs(2));
+            world.restart(1);
+            world.network.heal_all();
+            world.run_for(secs(20));
+            let rings = &world.hosts[0].rings;
+            let case = format!("{mode}, ends: {ends}: {}", world.describe());
+            assert_eq!(rings.given_up(pair.publisher.1), 0, "{case}");
+            assert_eq!(rings.given_up(other.publisher.1), 0, "{case}");
+            assert_eq!(world.received(other).len(), 20, "{case}");
+            assert_eq!(world.received(pair).len(), if ends { 0 } else { 20 }, "{case}");
+            assert_eq!(world.hosts[0].kept(), 0, "{case}");
+        }
     }
 }
