@@ -109,10 +109,11 @@ impl Links {
         let successor = replaced || current.is_some_and(|peer| peer.silence.is_gone());
         let candidate = Candidate { side, successor };
         let we_elect = ours < daemon;
-        let stands_by = self.may_stand_by(number, &hello, beside, now);
         let loses = |current: &LinkPeer| !new_wins(ours, daemon, current.candidate, candidate);
+        let loses = current.is_some_and(loses);
+        let stands_by = we_elect && self.may_stand_by(number, &hello, beside, now);
         // A connection that was to stand by beside an earlier link does not become the link in use.
-        if we_elect && !stands_by && (beside.is_some() || current.is_some_and(loses)) {
+        if we_elect && !stands_by && (beside.is_some() || loses) {
             self.table.remove(number);
             // The dial did not fail: the peer is linked.
             self.dials.opened(number);
@@ -143,7 +144,7 @@ impl Links {
             chain,
             silence: LinkSilence::new(side, now),
         });
-        if we_elect && stands_by {
+        if stands_by {
             self.elect_standby(number, now);
         } else if we_elect {
             let elected = self.next_elected(None, None);

@@ -140,6 +140,11 @@ impl LinkTable {
         self.standby.get(&daemon).copied()
     }
 
+    /// Returns the links that stand by, with their daemons.
+    pub(super) fn all_standby(&self) -> impl Iterator<Item = (DaemonId, u64)> {
+        self.standby.iter().map(|(daemon, number)| (*daemon, *number))
+    }
+
     /// Returns the number of links that stand by.
     pub(super) fn standby_count(&self) -> usize {
         self.standby.len()

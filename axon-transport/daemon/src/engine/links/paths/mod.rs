@@ -5,6 +5,7 @@ mod choice;
 mod copies;
 mod failover;
 mod peers;
+mod places;
 mod search;
 
 use std::{
@@ -46,8 +47,6 @@ use crate::{
     wire::beacon::Datagram,
 };
 
-/// Maximum number of links that stand by, of all peers.
-const MAX_STANDBY: usize = 64;
 /// Time since its last packet after which another link may replace one that stands by.
 const STANDBY_SILENT: Duration = Duration::from_secs(15);
 
@@ -65,20 +64,20 @@ impl Links {
             && current.is_some_and(|current| current.elected.map(|e| e.link) == beside)
     }
 
-    /// Returns whether this side elects a connection to stand by.
+    /// Returns whether this side elects a connection to stand by. A second link of another host may end for it.
     pub(super) fn may_stand_by(
-        &self,
+        &mut self,
         number: u64,
         hello: &LinkHello,
         beside: Option<[u8; 16]>,
         now: Duration,
     ) -> bool {
         let daemon = hello.daemon;
-        let has_room =
-            self.table.standby(daemon).is_some() || self.table.standby_count() < MAX_STANDBY;
         let is_needed = self.standby_silent_at(daemon) <= now;
-        let is_beside = self.is_beside(hello, beside);
-        is_needed && has_room && is_beside && !self.has_path_in_use(number, daemon)
+        is_needed
+            && self.is_beside(hello, beside)
+            && !self.has_path_in_use(number, daemon)
+            && self.make_standby_place(number, daemon, now)
     }
 
     /// Returns the time from which on there is no second path to a peer: its second link was silent for a while, or
@@ -131,6 +130,10 @@ impl Links {
             // The link in use changed meanwhile, or messages on two connections overtook each other.
             self.end_standby(number, "the link beside it changed", now);
             return self.opening_failed(number, None);
+        }
+        if !self.make_standby_place(number, daemon, now) {
+            self.end_standby(number, "this daemon has as many second links as it may", now);
+            return self.opening_failed(number);
         }
         let sealing = self.table.peer(number).and_then(|peer| peer.sealing.as_ref());
         if let (Some(keyring), Some(Sealing { exporters, .. })) = (&mut self.keyring, sealing)
@@ -389,7 +392,7 @@ impl Links {
     }
 
     /// Puts the link that stands by in use, or asks the side that elects links for it.
-    fn switch_over(&mut self, daemon: DaemonId, standby: u64, now: Duration) {
+    pub(super) fn switch_over(&mut self, daemon: DaemonId, standby: u64, now: Duration) {
         if self.hello.daemon < daemon {
             self.put_standby_in_use(standby, now);
         } else {
