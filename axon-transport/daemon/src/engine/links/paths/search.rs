@@ -20,6 +20,10 @@ const MAX_PROBE_DOUBLINGS: u32 = 10;
 /// Pause after the first dial. It doubles with each dial that brings no second path.
 const FIRST_DIAL_PAUSE: Duration = Duration::from_secs(2);
 const MAX_DIAL_DOUBLINGS: u32 = 6;
+/// Time that each dial costs, and the time that may be saved for dials that follow each other quickly. A second link
+/// that stood by and ended again costs a handshake and, in qkd, a key, whatever the reason of its end.
+const DIAL_COST: Duration = Duration::from_secs(5);
+const SAVED: Duration = Duration::from_secs(160);
 /// Time for which the side that does not elect leaves the first round, and a dial, to the other side.
 const SECOND_SIDE: Duration = Duration::from_secs(1);
 /// Time after which a second link counts as a success of its dial.
@@ -29,7 +33,7 @@ const SUCCESS: Duration = Duration::from_secs(1);
 ///
 /// Any host can send the beacons from which the addresses are known. So an address costs a probe, a datagram of a few
 /// bytes, until the peer's daemon answers there. All dials to the peer together have one budget: an answer proves
-/// nothing.
+/// nothing. A peer whose second links end again and again gets a dial each five seconds.
 #[derive(Debug)]
 pub(in crate::engine::links) struct PathSearch {
     addresses: Vec<PathAddress>,
@@ -45,6 +49,8 @@ pub(in crate::engine::links) struct PathSearch {
     dial_after: Duration,
     /// Number of dials since the last success.
     dials: u32,
+    /// The time up to which the dials are paid.
+    paid: Duration,
     /// The time since which a second link stands by.
     found_at: Option<Duration>,
     /// An address that answered and is dialled in a round from this time on, unless a better one answers before.
@@ -91,6 +97,7 @@ impl PathSearch {
             next: now + wait,
             dial_after: now,
             dials: 0,
+            paid: Duration::ZERO,
             found_at: None,
             choice: None,
         }
@@ -196,7 +203,9 @@ impl PathSearch {
 
     /// Begins a dial: the next round follows its pause.
     fn dial(&mut self, now: Duration, address: SocketAddr) -> SocketAddr {
-        self.dial_after = now + FIRST_DIAL_PAUSE * 2u32.pow(self.dials.min(MAX_DIAL_DOUBLINGS));
+        let pause = FIRST_DIAL_PAUSE * 2u32.pow(self.dials.min(MAX_DIAL_DOUBLINGS));
+        self.paid = self.paid.max(now.saturating_sub(SAVED)) + DIAL_COST;
+        self.dial_after = self.paid.max(now + pause);
         self.next = self.dial_after;
         self.dials += 1;
         self.forget_answers();
@@ -222,7 +231,7 @@ impl PathSearch {
         self.forget_answers();
         // A dial that brings a second link for a moment only counts as one that brings none.
         if self.found_at.take().is_some_and(|found_at| found_at + SUCCESS <= now) {
-            (self.dials, self.dial_after) = (0, now);
+            (self.dials, self.dial_after) = (0, self.paid.max(now));
         }
         self.since = now;
         self.next = (now + INTERVALS[0].1 + self.wait).max(self.dial_after);
@@ -304,6 +313,28 @@ mod tests {
         let due = search.poll_timeout().unwrap();
         let round = search.handle_timeout(due, address(1), || unreachable!());
         assert_eq!(round.dial, Some(address(2)), "there is no other");
+    }
+
+    #[test]
+    fn second_links_that_end_again_and_again_are_dialled_each_five_seconds() {
+        let mut search = search(&[1, 2]);
+        let (mut now, mut dials) = (NOW + Duration::from_secs(200), Vec::new());
+        let end = now + Duration::from_secs(300);
+        search.next = now;
+        while now < end {
+            now = search.poll_timeout().unwrap().max(now);
+            round(&mut search, now, 1);
+            let Some(found) = search.handle_echo(now, address(2), [1; 8], true, false) else {
+                continue;
+            };
+            dials.push(now);
+            search.handle_found(now, found);
+            now += SUCCESS;
+            search.handle_lost(now);
+        }
+        let first = dials.iter().filter(|dial| **dial < dials[0] + Duration::from_secs(50)).count();
+        assert!((32..=42).contains(&first), "{first} quick dials");
+        assert!((90..=96).contains(&dials.len()), "{} dials in 300 s", dials.len());
     }
 
     #[test]
