@@ -67,6 +67,12 @@ impl Copies {
         has_room
     }
 
+    /// Returns the number of copies that wait.
+    #[cfg(test)]
+    pub(super) fn waiting(&self) -> usize {
+        self.count
+    }
+
     fn remove(&mut self, flow: (u32, Gid), key: StreamKey) {
         let Some(keys) = self.waiting.get_mut(&flow) else { return };
         let before = keys.len();

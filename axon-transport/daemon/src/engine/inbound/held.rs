@@ -19,7 +19,14 @@ impl Inbound {
             self.full.len(),
             self.without_room.len(),
             self.limited.len(),
+            self.parked.len(),
+            self.copies.waiting(),
         ];
         lists.into_iter().max().unwrap_or_default()
+    }
+
+    /// Returns the number of copies that wait for the sample before them.
+    pub(in crate::engine) fn waiting_copies(&self) -> usize {
+        self.copies.waiting()
     }
 }

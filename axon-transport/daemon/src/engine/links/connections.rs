@@ -95,6 +95,12 @@ impl Connections {
         self.all.keys().copied().collect()
     }
 
+    /// Returns the number of connections that began.
+    #[cfg(test)]
+    pub(super) fn begun(&self) -> u64 {
+        self.next_number - 1
+    }
+
     /// Returns whether all connections have ended.
     pub(super) fn is_empty(&self) -> bool {
         self.all.is_empty()

@@ -55,6 +55,12 @@ impl Dials {
         self.under_way.len()
     }
 
+    /// Returns the number of dials that began.
+    #[cfg(test)]
+    pub(super) fn begun(&self) -> u64 {
+        self.next_number
+    }
+
     /// Returns a dial.
     pub(super) fn get_mut(&mut self, number: u64) -> Option<&mut LinkDial> {
         self.under_way.get_mut(&number)

@@ -9,8 +9,6 @@ mod election;
 mod ending;
 mod events;
 mod handshake_failure;
-#[cfg(test)]
-mod held;
 mod identity;
 mod inbox;
 mod keys;
@@ -18,6 +16,8 @@ mod link;
 mod opening;
 mod paths;
 mod silence;
+#[cfg(test)]
+pub(in crate::engine) mod simulated;
 mod table;
 mod unfinished;
 

@@ -7,6 +7,10 @@ use crate::{
 
 /// Links, as `links/election.rs` limits them.
 const LINKS: usize = 160;
+/// Links that stand by, as `links/paths/places.rs` limits them.
+const STANDBY: usize = 64;
+/// Copies of one peer that wait, as `inbound/copies.rs` limits them.
+const COPIES: usize = 32;
 /// Connections that are being opened: 64, and 16 of listed peers, that were dialled to this host, and its own dials.
 const OPENING: usize = 64 + 16;
 /// Bytes of the messages of one identity that have not all come, as `engine/account` limits them.
@@ -26,10 +30,10 @@ const UNREAD: usize = 65 << 20;
 /// It holds more than it may.
 pub(super) fn check(engine: &Engine, queue: usize, dials: usize) {
     let held = engine.links.held();
-    assert!(held.links <= LINKS, "{held:?}");
+    assert!(held.links - held.standby <= LINKS && held.standby <= STANDBY, "{held:?}");
     assert!(held.opening <= OPENING + dials && held.dials <= dials, "{held:?}, {dials} dials");
     // The same number may be closed; they are forgotten after three probe timeouts.
-    let open = LINKS + OPENING + dials;
+    let open = LINKS + STANDBY + OPENING + dials;
     assert!(held.connections <= 2 * open, "{held:?}");
     assert!(held.unsent <= UNSENT && held.unhandled <= UNREAD, "{held:?}");
     // Control messages are handled one by one, so all events that a pass leaves to the next belong to data streams.
@@ -39,6 +43,7 @@ pub(super) fn check(engine: &Engine, queue: usize, dials: usize) {
         let (streams, bytes) = peer.inbound.held();
         let most = 8 * STREAMS_OPEN as usize;
         assert!(streams <= most, "{streams} streams of one peer");
+        assert!(peer.inbound.waiting_copies() <= COPIES);
         assert!(peer.inbound.listed() <= streams, "{} entries", peer.inbound.listed());
         let account = std::rc::Rc::as_ptr(peer.remote.account());
         let (held, most) = identities.entry(account).or_insert((0, OF_IDENTITY));

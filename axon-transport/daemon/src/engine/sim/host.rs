@@ -35,7 +35,7 @@ use crate::{
         Effect, Engine, EngineParts,
         compression::{CompressionAnswer, Compressor},
         credentials::Credentials,
-        links::LinkParts,
+        links::{LinkParts, Links},
         peer::MAX_ROUTES,
         quic::transport::endpoint_config,
     },
@@ -62,6 +62,8 @@ pub(super) struct Host {
     pub(super) daemon: DaemonId,
     /// The daemon whose id the next one of this host claims.
     pub(super) poses_as: Option<DaemonId>,
+    /// A test makes its daemon lie, and take more than an honest one.
+    pub(super) lies: bool,
     pub(super) rings: SimRings,
     config: Arc<Config>,
     epoch: Instant,
@@ -111,6 +113,7 @@ impl Host {
             second: None,
             daemon: DaemonId::default(),
             poses_as: None,
+            lies: false,
             rings: SimRings::new(number),
             config: Arc::new(config),
             epoch,
@@ -275,6 +278,17 @@ impl Host {
         self.discovery.unwant(daemon);
     }
 
+    /// Returns the links of the host's daemon.
+    pub(super) fn links(&self) -> Option<&Links> {
+        self.engine.as_ref().map(|engine| &engine.links)
+    }
+
+    /// Returns the links of the host's daemon, for lies.
+    pub(super) fn links_mut(&mut self) -> Option<&mut Links> {
+        self.due.set(None);
+        self.engine.as_mut().map(|engine| &mut engine.links)
+    }
+
     /// Returns the bytes of the samples that wait for peers, and the number of bytes that have left the queues.
     pub(super) fn backlog(&self) -> (usize, usize) {
         self.engine.as_ref().map_or((0, 0), Engine::backlog)
@@ -332,7 +346,7 @@ impl Host {
     pub(super) fn check_held(&mut self, now: Duration) {
         let of_beacons = if self.beacons.is_some() { MOST_BEACON_DIALS } else { 0 };
         let dials = self.discovery.most_dials(now) + of_beacons;
-        if let Some(engine) = &self.engine {
+        if let Some(engine) = self.engine.as_ref().filter(|_| !self.lies) {
             super::held::check(engine, self.config.reliable_queue as usize, dials);
         }
     }

@@ -3,7 +3,7 @@
 
 use std::{
     collections::VecDeque,
-    net::{Ipv4Addr, SocketAddr},
+    net::{IpAddr, Ipv4Addr, SocketAddr},
     sync::Arc,
     time::{Duration, Instant},
 };
@@ -30,6 +30,8 @@ use crate::{
 /// A peer that a test controls, in classic mode.
 pub(super) struct Raw {
     pub(super) address: Ipv4Addr,
+    /// The address of the second interface, if it has one.
+    pub(super) second: Option<Ipv4Addr>,
     pub(super) daemon: DaemonId,
     /// The peer's connections, in the order in which they began.
     pub(super) links: Vec<RawLink>,
@@ -79,6 +81,7 @@ impl Raw {
         endpoint.supported_versions(vec![1]);
         Self {
             address,
+            second: None,
             daemon,
             links: Vec::new(),
             transport: Transports::new(&config).towards(address.into()),
@@ -142,13 +145,12 @@ impl Raw {
     pub(super) fn handle_datagram(
         &mut self,
         now: Duration,
-        from: SocketAddr,
+        (from, to): (SocketAddr, IpAddr),
         ecn: Option<EcnCodepoint>,
         bytes: BytesMut,
     ) {
         let (now, mut buffer) = (self.epoch + now, Vec::new());
-        let local = Some(self.address.into());
-        match self.endpoint.handle(now, from, local, ecn, bytes, &mut buffer) {
+        match self.endpoint.handle(now, from, Some(to), ecn, bytes, &mut buffer) {
             Some(DatagramEvent::ConnectionEvent(handle, event)) => {
                 if let Some(link) = self.links.iter_mut().find(|l| l.handle == Some(handle)) {
                     link.quic.handle_event(event);

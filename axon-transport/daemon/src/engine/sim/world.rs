@@ -128,6 +128,14 @@ impl World {
         second
     }
 
+    /// Gives a raw peer a second interface, in another network.
+    pub(super) fn add_second_interface_of_raw(&mut self, raw: usize) {
+        let [_, _, high, low] = self.raws[raw].address.octets();
+        let second = Ipv4Addr::new(10, SECOND_NETWORK, high, low);
+        self.network.add_interface(self.hosts.len() + raw, second, 1);
+        self.raws[raw].second = Some(second);
+    }
+
     /// Makes each host hear the beacons of all others, from all their addresses.
     pub(super) fn hear_all_addresses(&mut self) {
         for host in 0..self.hosts.len() {
@@ -163,9 +171,11 @@ impl World {
     fn pass_raw(&mut self, number: usize) {
         let (now, raw) = (self.now, &mut self.raws[number]);
         raw.pass(now);
-        let from = SocketAddr::from((raw.address, PORT));
+        let (first, second) = (raw.address, raw.second);
         while let Some((transmit, bytes)) = raw.poll_transmit(now) {
             let Transmit { destination: to, ecn, size, segment_size, .. } = transmit;
+            let from = second.filter(|_| is_second(to.ip())).unwrap_or(first);
+            let from = SocketAddr::from((from, PORT));
             self.network.send(now, from, to, ecn, &bytes[..size], segment_size);
         }
     }
@@ -365,7 +375,8 @@ impl World {
                 }
                 None => {
                     let raw = &mut self.raws[delivery.host - self.hosts.len()];
-                    raw.handle_datagram(now, delivery.from, delivery.ecn, bytes);
+                    let ends = (delivery.from, delivery.at.ip());
+                    raw.handle_datagram(now, ends, delivery.ecn, bytes);
                 }
             }
             came.insert(delivery.host);

@@ -16,4 +16,5 @@ mod replaced;
 mod rules;
 mod segment;
 mod torture;
+mod two_links;
 mod unfair;

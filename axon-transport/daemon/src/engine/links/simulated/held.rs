@@ -1,6 +1,6 @@
 //! The memory of this host that connections and links take, for the simulator.
 
-use super::Links;
+use crate::engine::links::Links;
 
 /// The numbers and bytes that are held.
 #[derive(Clone, Copy, Debug)]
@@ -9,6 +9,8 @@ pub(in crate::engine) struct HeldByLinks {
     pub(in crate::engine) connections: usize,
     /// Links whose peer is known.
     pub(in crate::engine) links: usize,
+    /// Links that stand by.
+    pub(in crate::engine) standby: usize,
     /// Connections that are being opened.
     pub(in crate::engine) opening: usize,
     pub(in crate::engine) dials: usize,
@@ -32,6 +34,7 @@ impl Links {
         HeldByLinks {
             connections: numbers.len(),
             links,
+            standby: self.table.standby_count(),
             opening: all - links,
             dials: self.dials.len(),
             events: self.outbox.waiting(),
