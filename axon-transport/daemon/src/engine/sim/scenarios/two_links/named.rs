@@ -136,6 +136,7 @@ fn liar_that_takes_nothing_and_switches_holds_no_publisher_up_for_long() {
         let shared = lying.world.pair(VICTIM, TWO_PATHS, "/shared", qos);
         lying.world.hosts[LIAR].rings.create_subscription("/shared", qos, Some(1));
         lying.world.hosts[LIAR].touch_graph();
+        lying.graph_from = lying.world.now + secs(1);
         lying.run(1000);
         let (start, mut published) = (lying.world.now, 0);
         while published < MANY {
