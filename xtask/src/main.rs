@@ -45,6 +45,9 @@ usage: cargo xtask COMMAND
                        the script of a seed that fails
   simulate --scenarios run all cases of the simulator's scenarios: daemons killed at each step, hostile
                        peers, rebinding NATs, many hosts. cargo test runs some of them
+  simulate --two-links [--seeds N] [--first SEED]
+                       play a hostile peer with two links: all single lies, and N seeds of acts by
+                       chance in each mode
   rustls-digests       after a change to patches/ or added/: write patched.sha256 anew
   rustls-checkout DIR [VERSION]
                        make DIR a git repository with rustls's source and a commit a patch, and

@@ -12,6 +12,8 @@ pub(crate) enum Options {
     Seeds(Seeds),
     /// The scenarios, each with all of its cases.
     Scenarios,
+    /// The scenarios of a hostile peer with two links: all lies in all modes, and these seeds of acts by chance.
+    TwoLinks { first: u64, seeds: u64 },
 }
 
 /// Runs of mixed faults.
@@ -30,6 +32,15 @@ impl Options {
     pub(crate) fn parse(options: &[&str]) -> Option<Self> {
         if options == ["--scenarios"] {
             return Some(Self::Scenarios);
+        }
+        if let ["--two-links", options @ ..] = options {
+            return match Self::parse(options)? {
+                Self::Seeds(Seeds { first, seeds, hosts: 3 }) => {
+                    let seeds = if options.contains(&"--seeds") { seeds } else { 200 };
+                    Some(Self::TwoLinks { first, seeds })
+                }
+                _ => None,
+            };
         }
         let mut parsed = Seeds { first: 1, seeds: 5000, hosts: 3 };
         let mut options = options.iter();
@@ -62,6 +73,11 @@ pub(crate) fn simulate(options: Options) -> Result<String> {
             .env("SIMULATE_SEEDS", seeds.to_string())
             .env("SIMULATE_HOSTS", hosts.to_string()),
         Options::Scenarios => command.args(["engine::sim", "--nocapture"]).env("SIMULATE_ALL", "1"),
+        Options::TwoLinks { first, seeds } => command
+            .args(["engine::sim::scenarios::two_links", "--nocapture"])
+            .env("SIMULATE_ALL", "1")
+            .env("SIMULATE_FIRST", first.to_string())
+            .env("SIMULATE_SEEDS", seeds.to_string()),
     };
     let status = command.status().map_err(|error| format!("cargo cannot be started: {error}"))?;
     let what = match options {
@@ -69,6 +85,9 @@ pub(crate) fn simulate(options: Options) -> Result<String> {
             format!("seeds {first} to {}, {hosts} hosts each", first + seeds - 1)
         }
         Options::Scenarios => "all cases of the scenarios".to_owned(),
+        Options::TwoLinks { first, seeds } => {
+            format!("a hostile peer with two links, seeds {first} to {}", first + seeds - 1)
+        }
     };
     if status.success() {
         Ok(format!("{what}: no promise was broken"))
@@ -90,12 +109,18 @@ mod tests {
             Options::parse(&["--first", "7", "--seeds", "10", "--hosts", "50"]),
             some(7, 10, 50)
         );
+        let two_links = |first, seeds| Some(Options::TwoLinks { first, seeds });
+        assert_eq!(Options::parse(&["--two-links"]), two_links(1, 200));
+        let some_seeds = ["--two-links", "--first", "7", "--seeds", "9"];
+        assert_eq!(Options::parse(&some_seeds), two_links(7, 9));
         for wrong in [
             &["--hosts", "1"][..],
             &["--seeds"],
             &["--seeds", "0"],
             &["--many", "1"],
             &["--scenarios", "1"],
+            &["--two-links", "--scenarios"],
+            &["--two-links", "--hosts", "4"],
         ] {
             assert_eq!(Options::parse(wrong), None, "{wrong:?}");
         }

@@ -28,7 +28,7 @@ use crate::{
 
 /// Bytes of a copy's number of the sample before it.
 pub(super) const AFTER: usize = 8;
-/// Maximum length of a copy's message.
+/// Maximum length of a copy's message, with its headers or its envelope.
 const MAX_LENGTH: u64 = (SMALL + MAX_OVERHEAD) as u64;
 /// Time for which a copy waits for the sample before it.
 const PATIENCE: Duration = Duration::from_secs(1);
@@ -115,15 +115,27 @@ impl Copies {
     }
 }
 
-/// Checks the length of a copy's message.
+/// Checks the length of a copy's message before it is read. The payload in it is at most as long.
 ///
 /// # Errors
-/// It is longer than the samples that are copied.
+/// It is longer than any message with a payload that is copied.
 pub(super) fn permit_length(length: u64) -> Result<(), LinkViolation> {
     if length <= MAX_LENGTH {
         return Ok(());
     }
     let text = format!("a copy of {length} bytes, at most {MAX_LENGTH} are allowed");
+    Err((CloseCode::TooLarge, text))
+}
+
+/// Checks the length of a copy's payload. Its headers, and in `messages10` its envelope, do not count.
+///
+/// # Errors
+/// It is longer than the samples that are copied.
+pub(super) fn permit_payload(length: usize) -> Result<(), LinkViolation> {
+    if length <= SMALL {
+        return Ok(());
+    }
+    let text = format!("a copy with a payload of {length} bytes, at most {SMALL} are allowed");
     Err((CloseCode::TooLarge, text))
 }
 

@@ -8,7 +8,7 @@ use bytes::Bytes;
 
 use super::{
     ARRIVAL, ENDED, Inbound, LONG_MESSAGE_BYTES, LinkViolation, NO_ROUTE, StreamKey, TURN,
-    copies::{AFTER, permit_length, read_after},
+    copies::{AFTER, permit_length, permit_payload, read_after},
     incoming::{IncomingStream, OpenedMessage, Piece, StreamStep},
 };
 use crate::engine::sample::stream_header::{HEADER, StreamHeader};
@@ -284,6 +284,7 @@ impl Inbound {
             if opened.compressed {
                 return Err(malformed("a copy that is compressed"));
             }
+            permit_payload(payload.len())?;
             let message = self.message(header, route, &opened, payload, now);
             self.release(stream);
             stream.step = Self::copy_step(message, now);

@@ -13,6 +13,7 @@ use super::{
         LinkPeer, LinkPhase,
         age::{Age, AgeStep},
     },
+    paths::TakeOver,
     silence::{LinkSilence, Traffic},
 };
 use crate::{
@@ -146,15 +147,36 @@ impl Links {
         });
         if stands_by {
             self.elect_standby(number, now);
+        } else if we_elect && side == Side::Server {
+            self.handle_take_over(number, TakeOver::Dialled, now);
         } else if we_elect {
-            let elected = self.next_elected(None, None);
-            self.send(number, &LinkMessage::Elected(elected), now);
-            if let Some(peer) = self.table.peer_mut(number) {
-                peer.order.elected();
-            }
-            self.open(number, elected, now);
+            self.elect(number, now);
         }
         self.connections.touch(number);
+    }
+
+    /// Elects a connection that the peer dialled and that waited, unless another connection stands now.
+    pub(super) fn elect_dialled(&mut self, number: u64, now: Duration) {
+        let Some(peer) = self.table.peer(number) else { return };
+        let daemon = peer.summary.hello.daemon;
+        let stands = self.table.current_peer(daemon).is_some_and(|current| {
+            !new_wins(self.hello.daemon, daemon, current.candidate, peer.candidate)
+        });
+        if stands {
+            self.close_connection(number, CloseCode::Duplicate, "another connection stands", now);
+            return self.end_link(number, "another connection stands", None, now);
+        }
+        self.elect(number, now);
+    }
+
+    /// Elects a connection: it becomes the link in use.
+    fn elect(&mut self, number: u64, now: Duration) {
+        let elected = self.next_elected(None, None);
+        self.send(number, &LinkMessage::Elected(elected), now);
+        if let Some(peer) = self.table.peer_mut(number) {
+            peer.order.elected();
+        }
+        self.open(number, elected, now);
     }
 
     /// Returns the next election, of the `link` with this name or of one with a new name.

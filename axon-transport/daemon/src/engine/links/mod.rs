@@ -47,7 +47,7 @@ use self::{
     events::LinkOutbox,
     inbox::DiscoveryInbox,
     link::{Link, LinkPhase, view::LinkView},
-    paths::PeerPaths,
+    paths::{PeerPaths, TakeOver},
     silence::{CheckSchedule, Nonce, frames_came},
     table::LinkTable,
     unfinished::UnfinishedConnections,
@@ -318,7 +318,7 @@ impl Links {
             {
                 return;
             }
-            if matches!(link.phase, LinkPhase::Handshake(..)) {
+            if matches!(link.phase, LinkPhase::Handshake(..)) || link.postponed.is_some() {
                 return;
             }
             let account = link.peer.as_ref().map(|peer| Rc::clone(&peer.account));
@@ -378,8 +378,10 @@ impl Links {
         }
         let daemon = peer.summary.hello.daemon;
         match message {
-            LinkMessage::Elected(elected) => self.handle_elected(number, elected, now),
-            LinkMessage::SwitchOver => self.handle_switch_over(number, daemon, now),
+            LinkMessage::Elected(elected) => {
+                self.handle_take_over(number, TakeOver::Elected(elected), now);
+            }
+            LinkMessage::SwitchOver => self.handle_take_over(number, TakeOver::SwitchOver, now),
             LinkMessage::Keys(keys) => {
                 let Some(keyring) = self.keyring.as_mut().filter(|_| peer.seals) else { return };
                 if let Err(error) = keyring.handle_message(now, number, &keys) {
@@ -499,6 +501,10 @@ impl Links {
 
     fn link_timeout(&mut self, number: u64, now: Duration) {
         let Some(link) = self.table.get_mut(number) else { return };
+        if let Some((_, reason)) = link.postponed.take_if(|(due, _)| *due <= now) {
+            self.handle_take_over(number, reason, now);
+            return self.connections.touch(number);
+        }
         match &mut link.phase {
             LinkPhase::Handshake(..) => {
                 let resolver = link.resolver.take();

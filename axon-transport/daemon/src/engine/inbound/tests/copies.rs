@@ -1,7 +1,7 @@
 //! Copies of samples, which come over the second path.
 
 use super::*;
-use crate::engine::inbound::copies::{ReadCopy, permit_length};
+use crate::engine::inbound::copies::{ReadCopy, permit_length, permit_payload};
 
 fn at(ms: u64) -> Duration {
     NOW + Duration::from_millis(ms)
@@ -200,5 +200,8 @@ fn copy_of_an_unknown_publisher_or_route_is_dropped() {
 fn long_copy_is_a_violation() {
     permit_length(4096 + 64).unwrap();
     let (code, _) = permit_length(1 << 20).unwrap_err();
+    assert_eq!(code, CloseCode::TooLarge);
+    permit_payload(4096).unwrap();
+    let (code, _) = permit_payload(4097).unwrap_err();
     assert_eq!(code, CloseCode::TooLarge);
 }

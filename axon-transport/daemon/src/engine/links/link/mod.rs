@@ -21,7 +21,7 @@ use crate::{
     engine::{
         account::{Account, Charge},
         link::opening::{Opening, Sealing},
-        links::{admission::HandshakeSlot, silence::LinkSilence},
+        links::{admission::HandshakeSlot, paths::TakeOver, silence::LinkSilence},
     },
     keys::Resolver,
     link::{Candidate, Elected, LinkHello, MessageOrder, Side},
@@ -53,6 +53,8 @@ pub(super) struct Link {
     pub(super) expected: Option<DaemonId>,
     /// The link in use beside which it is to stand by, as its dialler stated.
     pub(super) beside: Option<[u8; 16]>,
+    /// The reason why it comes in use at this time. It waits because the peer caused too many take-overs.
+    pub(super) postponed: Option<(Duration, TakeOver)>,
     /// The peer, once HELLO was checked and its name proven.
     pub(super) peer: Option<LinkPeer>,
     /// The place of its handshake among those under way.
@@ -119,6 +121,7 @@ impl Link {
             replaces: None,
             expected: None,
             beside: None,
+            postponed: None,
             peer: None,
             place: None,
             resolver: None,
@@ -138,7 +141,8 @@ impl Link {
         let ages = matches!(self.phase, LinkPhase::Standby | LinkPhase::Open);
         let age = peer.filter(|_| ages).and_then(|peer| peer.age.poll_timeout());
         let probe = peer.and_then(|peer| peer.silence.poll_timeout());
-        [phase, age, probe].into_iter().flatten().min()
+        let postponed = self.postponed.as_ref().map(|(due, _)| *due);
+        [phase, age, probe, postponed].into_iter().flatten().min()
     }
 
     /// Returns whether data may come over it: it is, or was, elected.

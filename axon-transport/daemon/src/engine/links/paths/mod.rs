@@ -1,12 +1,14 @@
 //! Two paths to a peer: a second link stands by at another address of the peer, and takes over when the path of the
 //! link in use does not answer.
 
+mod budget;
 mod choice;
 mod copies;
 mod failover;
 mod peers;
 mod places;
 mod search;
+mod take_overs;
 
 use std::{
     net::{IpAddr, SocketAddr},
@@ -17,13 +19,13 @@ use axon_shm::ids::DaemonId;
 use axon_transport::status::StandbyStatus;
 use rand::RngExt;
 
-pub(super) use self::peers::PeerPaths;
 use self::{
     choice::{PathChoice, PathQuality},
     failover::{Failover, FailoverStep},
     peers::Paths,
     search::{PathSearch, is_other},
 };
+pub(super) use self::{peers::PeerPaths, take_overs::TakeOver};
 use super::{
     Links,
     identity::OTHERS,
@@ -31,7 +33,7 @@ use super::{
         LinkPhase,
         age::{Age, AgeStep},
     },
-    silence::{Nonce, Traffic},
+    silence::Nonce,
 };
 use crate::{
     engine::{
@@ -233,74 +235,6 @@ impl Links {
         self.end_standby(number, "AXON_QKD_SESSION_MAX_AGE is near", now);
     }
 
-    /// Handles the peer's request to put the link that stands by in use.
-    pub(super) fn handle_switch_over(&mut self, number: u64, daemon: DaemonId, now: Duration) {
-        if self.table.standby(daemon) == Some(number) {
-            self.put_standby_in_use(number, now);
-        }
-    }
-
-    /// Handles ELECTED for a link that stands by: it takes over from the link in use.
-    pub(super) fn handle_elected(&mut self, number: u64, elected: Elected, now: Duration) {
-        if elected.standby == Some(true) {
-            return self.stand_by(number, elected, now);
-        }
-        let Some(link) = self.table.get(number) else { return };
-        let Some(peer) = &link.peer else { return };
-        let (daemon, before) = (peer.summary.hello.daemon, peer.elected);
-        let (who, proven) = (peer.summary.who.clone(), peer.proven);
-        let stands_by = self.table.standby(daemon) == Some(number);
-        let is_another = before.is_some_and(|before| before.link != elected.link);
-        if is_another || (link.beside.is_some() && !stands_by) {
-            let why = "ELECTED puts a link in use that does not stand by";
-            return self.violation(number, CloseCode::OutOfOrder, why, now);
-        }
-        // [`open`](Self::open) refuses a link under another host's id, and a link that is older than the one in use.
-        let current = self.table.current_peer(daemon).and_then(|current| current.elected);
-        let is_newest = current.is_none_or(|current| current.election < elected.election);
-        if stands_by && is_newest && self.claim(daemon, &who, proven, now).is_ok() {
-            self.give_up_silent(daemon, now);
-        }
-        if stands_by {
-            self.table.take_standby(daemon);
-            if let Some(connection) = self.connections.get_mut(number) {
-                connection.copies.give_up(&mut connection.quic);
-            }
-            if let Some(paths) = self.paths.all.get_mut(&daemon) {
-                paths.search.handle_lost(now);
-            }
-        }
-        if let Some(peer) = self.table.peer_mut(number) {
-            peer.order.elected();
-        }
-        self.open(number, elected, now);
-    }
-
-    /// Elects the link that stands by.
-    fn put_standby_in_use(&mut self, number: u64, now: Duration) {
-        let Some(before) = self.table.peer(number).and_then(|peer| peer.elected) else { return };
-        let elected = self.next_elected(Some(before.link), None);
-        self.send(number, &LinkMessage::Elected(elected), now);
-        self.handle_elected(number, elected, now);
-    }
-
-    /// Takes the link in use for silent if it does not answer: nothing is expected over it when another one takes over. A
-    /// link that answers delivers what is in flight.
-    fn give_up_silent(&mut self, daemon: DaemonId, now: Duration) {
-        let Some(number) = self.table.current(daemon) else { return };
-        let (Some(connection), Some(peer)) =
-            (self.connections.get(number), self.table.peer_mut(number))
-        else {
-            return;
-        };
-        let since = connection.watch.as_ref().and_then(AnswerWatch::since);
-        if since
-            .is_some_and(|since| since + failover::silent_after(connection.quic.rtt()) / 2 <= now)
-        {
-            peer.silence.handle_failover(Traffic::from(&connection.quic.stats()));
-        }
-    }
-
     fn exchange(&self, number: u64) -> Exchange {
         let connection = self.connections.get(number);
         connection.map(|c| Exchange::from(&c.quic.stats())).unwrap_or_default()
@@ -388,15 +322,6 @@ impl Links {
                     "the path does not answer and the second one does: the second link takes over");
                 self.switch_over(daemon, standby, now);
             }
-        }
-    }
-
-    /// Puts the link that stands by in use, or asks the side that elects links for it.
-    pub(super) fn switch_over(&mut self, daemon: DaemonId, standby: u64, now: Duration) {
-        if self.hello.daemon < daemon {
-            self.put_standby_in_use(standby, now);
-        } else {
-            self.send(standby, &LinkMessage::SwitchOver, now);
         }
     }
 

@@ -4,12 +4,13 @@ use std::collections::HashMap;
 
 use axon_shm::ids::DaemonId;
 
-use super::{choice::PathChoice, failover::Failover, search::PathSearch};
+use super::{choice::PathChoice, failover::Failover, search::PathSearch, take_overs::TakeOvers};
 
 /// The paths to the peers that may have two links at a time.
 #[derive(Default)]
 pub(in crate::engine::links) struct PeerPaths {
     pub(super) all: HashMap<DaemonId, Paths>,
+    pub(super) take_overs: TakeOvers,
 }
 
 /// The paths to one peer.

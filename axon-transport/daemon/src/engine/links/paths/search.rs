@@ -2,6 +2,7 @@
 
 use std::{net::SocketAddr, time::Duration};
 
+use super::budget::{Budget, Rate};
 use crate::engine::links::silence::Nonce;
 
 /// Maximum number of addresses that are tried.
@@ -20,10 +21,9 @@ const MAX_PROBE_DOUBLINGS: u32 = 10;
 /// Pause after the first dial. It doubles with each dial that brings no second path.
 const FIRST_DIAL_PAUSE: Duration = Duration::from_secs(2);
 const MAX_DIAL_DOUBLINGS: u32 = 6;
-/// Time that each dial costs, and the time that may be saved for dials that follow each other quickly. A second link
-/// that stood by and ended again costs a handshake and, in qkd, a key, whatever the reason of its end.
-const DIAL_COST: Duration = Duration::from_secs(5);
-const SAVED: Duration = Duration::from_secs(160);
+/// Dials to a peer: 32 at once, then one each five seconds. A second link that stood by and ended again costs a
+/// handshake and, in qkd, a key, whatever the reason of its end.
+const DIALS: Rate = Rate { pause: Duration::from_secs(5), at_once: 32 };
 /// Time for which the side that does not elect leaves the first round, and a dial, to the other side.
 const SECOND_SIDE: Duration = Duration::from_secs(1);
 /// Time after which a second link counts as a success of its dial.
@@ -49,8 +49,7 @@ pub(in crate::engine::links) struct PathSearch {
     dial_after: Duration,
     /// Number of dials since the last success.
     dials: u32,
-    /// The time up to which the dials are paid.
-    paid: Duration,
+    budget: Budget,
     /// The time since which a second link stands by.
     found_at: Option<Duration>,
     /// An address that answered and is dialled in a round from this time on, unless a better one answers before.
@@ -97,7 +96,7 @@ impl PathSearch {
             next: now + wait,
             dial_after: now,
             dials: 0,
-            paid: Duration::ZERO,
+            budget: Budget::default(),
             found_at: None,
             choice: None,
         }
@@ -204,8 +203,8 @@ impl PathSearch {
     /// Begins a dial: the next round follows its pause.
     fn dial(&mut self, now: Duration, address: SocketAddr) -> SocketAddr {
         let pause = FIRST_DIAL_PAUSE * 2u32.pow(self.dials.min(MAX_DIAL_DOUBLINGS));
-        self.paid = self.paid.max(now.saturating_sub(SAVED)) + DIAL_COST;
-        self.dial_after = self.paid.max(now + pause);
+        self.budget.pay(DIALS, now);
+        self.dial_after = self.budget.due(DIALS).max(now + pause);
         self.next = self.dial_after;
         self.dials += 1;
         self.forget_answers();
@@ -231,7 +230,7 @@ impl PathSearch {
         self.forget_answers();
         // A dial that brings a second link for a moment only counts as one that brings none.
         if self.found_at.take().is_some_and(|found_at| found_at + SUCCESS <= now) {
-            (self.dials, self.dial_after) = (0, self.paid.max(now));
+            (self.dials, self.dial_after) = (0, self.budget.due(DIALS).max(now));
         }
         self.since = now;
         self.next = (now + INTERVALS[0].1 + self.wait).max(self.dial_after);
@@ -318,7 +317,7 @@ mod tests {
     #[test]
     fn second_links_that_end_again_and_again_are_dialled_each_five_seconds() {
         let mut search = search(&[1, 2]);
-        let (mut now, mut dials) = (NOW + Duration::from_secs(200), Vec::new());
+        let (mut now, mut dials) = (NOW, Vec::new());
         let end = now + Duration::from_secs(300);
         search.next = now;
         while now < end {

@@ -267,6 +267,12 @@ impl Lying {
         (of(false), of(true))
     }
 
+    /// Returns the link in use with the liar at the victim.
+    fn victims_link(&self) -> Option<u64> {
+        let links = self.world.hosts[VICTIM].links()?;
+        links.with_daemon(self.world.hosts[LIAR].daemon)[0].last().copied()
+    }
+
     fn victim_daemon(&self) -> DaemonId {
         self.world.hosts[VICTIM].daemon
     }

@@ -127,7 +127,7 @@ fn play(seed: u64, mode: &str, lying: &mut Lying) {
 
 /// Plays some seeds in a mode.
 fn harm_nobody(mode: &str) {
-    let seeds = if all_cases() { 2000 } else { 70 };
+    let seeds = if all_cases() { 200 } else { 1 };
     let (first, seeds) = (setting("SIMULATE_FIRST", 1), setting("SIMULATE_SEEDS", seeds));
     let config = modes().into_iter().find(|(name, _)| *name == mode).expect("a mode").1;
     for seed in first..first + seeds {

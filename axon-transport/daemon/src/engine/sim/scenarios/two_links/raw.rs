@@ -267,18 +267,18 @@ fn copies_under_the_name_of_another_host_reach_nobody() {
 
 #[test]
 fn copy_that_breaks_the_format_ends_the_link_that_it_came_over() {
-    let long = |mut copy: CopyStream| {
-        copy.length = 5000;
-        copy.encode()
-    };
+    // A payload of 4,096 bytes is the longest one: 24 bytes are before those of `length`.
+    let long = |copy: CopyStream| CopyStream { length: 4097 - 24, ..copy }.encode();
+    let longer = |copy: CopyStream| CopyStream { length: 5000, ..copy }.encode();
     let short = |copy: CopyStream| {
         let mut bytes = copy.encode().to_vec();
         bytes[1] |= 1;
         Bytes::from(bytes)
     };
     let other_writer = |copy: CopyStream| CopyStream { writer: of_raw(9), ..copy }.encode();
-    let cases: [(CloseCode, &dyn Fn(CopyStream) -> Bytes); 3] = [
+    let cases: [(CloseCode, &dyn Fn(CopyStream) -> Bytes); 4] = [
         (CloseCode::TooLarge, &long),
+        (CloseCode::TooLarge, &longer),
         (CloseCode::Malformed, &short),
         (CloseCode::Malformed, &other_writer),
     ];
@@ -290,7 +290,11 @@ fn copy_that_breaks_the_format_ends_the_link_that_it_came_over() {
         assert!(liar.link(first).closed.is_none());
         // The link in use goes on, and another second link may stand by.
         let third = liar.stands(3, 3);
-        liar.open(third, copy(route, 1, 0));
+        let longest =
+            CopyStream { length: 4096 - 24, ..CopyStream::new("/t", route, of_raw(1), 1) };
+        liar.open(third, longest.encode());
+        liar.run(100);
+        assert_eq!(liar.world.hosts[0].rings.received(subscription, of_raw(1)), [1]);
         liar.open(first, samples(route, "/t", of_raw(1), 1..=2));
         liar.run(200);
         let received = liar.world.hosts[0].rings.received(subscription, of_raw(1));
