@@ -135,7 +135,7 @@ impl Links {
         }
         if !self.make_standby_place(number, daemon, now) {
             self.end_standby(number, "this daemon has as many second links as it may", now);
-            return self.opening_failed(number);
+            return self.opening_failed(number, None);
         }
         let sealing = self.table.peer(number).and_then(|peer| peer.sealing.as_ref());
         if let (Some(keyring), Some(Sealing { exporters, .. })) = (&mut self.keyring, sealing)
