@@ -4,7 +4,9 @@
 //! - What a subscription that lives did not get between two samples of one publisher, it counts as lost.
 //! - Between KEEP_ALL endpoints that live no sample is missing that was published while the subscriber was matched, unless
 //!   the publisher counts it as given up. It gives up samples only after a daemon was killed whose successor did not link
-//!   in time, so never where the path was left alone. On one host nothing is missing.
+//!   in time, so never where the path was left alone; or for a subscriber that ended when the daemon of its publisher's
+//!   host was killed, as the next daemon cannot know of it. A sample may be published after a relay was given up and
+//!   before the publisher hears that its subscriber is gone. On one host nothing is missing.
 //! - All samples of a publisher that ended arrive if they were acknowledged, or if no daemon was killed and the path was
 //!   good around its end. Of a publisher that was killed the last ones may be missing.
 //! - A TRANSIENT_LOCAL subscriber gets the whole history, whenever it came.
@@ -25,6 +27,8 @@ const LAST: u64 = 10;
 /// How long after a daemon's death a publisher may give up what the daemon had not delivered: it keeps that for ten
 /// seconds, and then may be busy.
 const GIVEN_UP: u64 = 60 * SECOND;
+/// How long a publisher keeps samples for the relay of a daemon that was killed.
+const ABSENCE: u64 = 10 * SECOND;
 /// Around the end of a publisher a daemon's death may cost samples: it may have been down before, and the publisher stays
 /// for ten seconds.
 const ENDING: [u64; 2] = [15 * SECOND, 25 * SECOND];
@@ -167,7 +171,9 @@ impl<'a> Judge<'a> {
                 }
             }
         }
-        let allowed = if is_here { 0 } else { publisher.given_up() };
+        let (given_up, unmatched) = (publisher.given_up(), publisher.unmatched(&subscriber.gid));
+        let between = if given_up > 0 { unmatched } else { 0 };
+        let allowed = if is_here { 0 } else { given_up + between };
         if missing.len() as u64 > allowed {
             let what = format!("published for it ({allowed} given up, {:?})", publisher.fate);
             return self.tell_missing(publisher, subscriber, &missing, &what);
@@ -192,11 +198,29 @@ impl<'a> Judge<'a> {
 
     fn check_given_up(&mut self, publisher: &Entry) {
         for (at, total) in &publisher.publishing.given_up {
-            if !self.record.has_rough_kill(at.saturating_sub(GIVEN_UP), *at) {
+            let is_excused = self.record.has_rough_kill(at.saturating_sub(GIVEN_UP), *at)
+                || self.has_ended_reader(publisher, *at);
+            if !is_excused {
                 let what = "though no daemon was killed over a path that was cut or poor";
                 self.tell(publisher, format!("has given up {total} samples at {at}, {what}"));
             }
         }
+    }
+
+    /// Whether a matched subscriber of the other host was killed around the death of a daemon, long enough before `at` for
+    /// its samples to be given up.
+    fn has_ended_reader(&self, publisher: &Entry, at: u64) -> bool {
+        let died = |subscriber: &Entry| match subscriber.fate {
+            Fate::Killed { at } if subscriber.host != publisher.host => Some(at),
+            _ => None,
+        };
+        let was_matched = |subscriber: &&Entry| publisher.was_matched(&subscriber.gid);
+        let mut deaths = self.ledger.entries.iter().filter(was_matched).filter_map(died);
+        deaths.any(|death| {
+            let (from, to) = (death.saturating_sub(ABSENCE), death + ABSENCE);
+            let to = to.min(at.saturating_sub(ABSENCE));
+            death + GIVEN_UP > at && self.record.has_kill(from, to)
+        })
     }
 
     pub(super) fn calls(&mut self) -> Calls {

@@ -235,6 +235,18 @@ impl Entry {
         ranges.map(|((from, _), to)| (*from, to)).filter(|(from, to)| from <= to).collect()
     }
 
+    /// Whether the publisher ever saw this subscriber.
+    pub(super) fn was_matched(&self, reader: &str) -> bool {
+        self.publishing.matched.iter().any(|(_, readers)| readers.contains(reader))
+    }
+
+    /// How often the publisher saw this subscriber go.
+    pub(super) fn unmatched(&self, reader: &str) -> u64 {
+        let changes = self.publishing.matched.windows(2);
+        let gone = changes.filter(|pair| pair[0].1.contains(reader) && !pair[1].1.contains(reader));
+        gone.count() as u64
+    }
+
     /// How many samples the publisher has given up.
     pub(super) fn given_up(&self) -> u64 {
         self.publishing.given_up.last().map_or(0, |(_, total)| *total)
