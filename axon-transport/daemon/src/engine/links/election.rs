@@ -12,8 +12,8 @@ use super::{
     link::{
         LinkPeer, LinkPhase,
         age::{Age, AgeStep},
+        take_over::TakeOver,
     },
-    paths::TakeOver,
     silence::{LinkSilence, Traffic},
 };
 use crate::{

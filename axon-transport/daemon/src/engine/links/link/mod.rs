@@ -2,6 +2,7 @@
 
 pub(super) mod age;
 pub(super) mod hand_over;
+pub(super) mod take_over;
 pub(super) mod view;
 
 use std::{
@@ -15,13 +16,13 @@ use axon_tls::Negotiated;
 use axon_transport::status::LinkStatus;
 use rustls_pki_types::CertificateDer;
 
-use self::{age::Age, hand_over::DrainingLink};
+use self::{age::Age, hand_over::DrainingLink, take_over::TakeOver};
 use super::identity::PeerIdentity;
 use crate::{
     engine::{
         account::{Account, Charge},
         link::opening::{Opening, Sealing},
-        links::{admission::HandshakeSlot, paths::TakeOver, silence::LinkSilence},
+        links::{admission::HandshakeSlot, silence::LinkSilence},
     },
     keys::Resolver,
     link::{Candidate, Elected, LinkHello, MessageOrder, Side},

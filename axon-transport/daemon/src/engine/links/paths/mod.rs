@@ -8,6 +8,7 @@ mod failover;
 mod peers;
 mod places;
 mod search;
+mod take_over_budget;
 mod take_overs;
 
 use std::{
@@ -19,13 +20,13 @@ use axon_shm::ids::DaemonId;
 use axon_transport::status::StandbyStatus;
 use rand::RngExt;
 
+pub(super) use self::peers::PeerPaths;
 use self::{
     choice::{PathChoice, PathQuality},
     failover::{Failover, FailoverStep},
     peers::Paths,
     search::{PathSearch, is_other},
 };
-pub(super) use self::{peers::PeerPaths, take_overs::TakeOver};
 use super::{
     Links,
     identity::OTHERS,

@@ -4,7 +4,9 @@ use std::collections::HashMap;
 
 use axon_shm::ids::DaemonId;
 
-use super::{choice::PathChoice, failover::Failover, search::PathSearch, take_overs::TakeOvers};
+use super::{
+    choice::PathChoice, failover::Failover, search::PathSearch, take_over_budget::TakeOvers,
+};
 
 /// The paths to the peers that may have two links at a time.
 #[derive(Default)]

@@ -1,59 +1,17 @@
 //! Take-overs: another link comes in use. A peer may cause a bounded number of them.
 
-use std::{collections::HashMap, time::Duration};
+use std::time::Duration;
 
 use axon_shm::ids::DaemonId;
 
-use super::{
-    budget::{Budget, Rate},
-    failover,
-};
+use super::failover;
 use crate::{
     engine::{
-        links::{Links, silence::Traffic},
+        links::{Links, link::take_over::TakeOver, silence::Traffic},
         quic::answers::AnswerWatch,
     },
     link::{CloseCode, Elected, LinkMessage},
 };
-
-/// Take-overs that a peer may cause: eight at once, then one each second. After each of them this host sends its graph
-/// and the unacknowledged samples again. Two take-overs of an honest peer are a second apart: a second link is looked
-/// for during a second, and a path counts as cut after 300 ms.
-const TAKE_OVERS: Rate = Rate { pause: Duration::from_secs(1), at_once: 8 };
-
-/// The reason why a link comes in use.
-#[derive(Clone, Copy, Debug)]
-pub(in crate::engine::links) enum TakeOver {
-    /// The peer elected it.
-    Elected(Elected),
-    /// The peer asks this side to elect the link, which stands by.
-    SwitchOver,
-    /// The peer dialled it, and this side elects.
-    Dialled,
-}
-
-/// The take-overs that each peer may cause. It outlives the peer's links.
-#[derive(Debug, Default)]
-pub(super) struct TakeOvers {
-    budgets: HashMap<DaemonId, Budget>,
-}
-
-impl TakeOvers {
-    /// Records a take-over that a peer causes.
-    ///
-    /// # Errors
-    /// The time of the next one that is permitted.
-    fn begin(&mut self, daemon: DaemonId, now: Duration) -> Result<(), Duration> {
-        self.budgets.retain(|_, budget| !budget.is_full(now));
-        let budget = self.budgets.entry(daemon).or_default();
-        let due = budget.due(TAKE_OVERS);
-        if now < due {
-            return Err(due);
-        }
-        budget.pay(TAKE_OVERS, now);
-        Ok(())
-    }
-}
 
 impl Links {
     /// Handles that a peer causes a link to come in use. If the peer caused too many take-overs, the link waits: no further
@@ -182,39 +140,6 @@ impl Links {
             self.put_standby_in_use(standby, now);
         } else {
             self.send(standby, &LinkMessage::SwitchOver, now);
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn peer_that_switches_on_and_on_gets_one_take_over_each_second() {
-        let (peer, other) = (DaemonId([1; 16]), DaemonId([2; 16]));
-        let mut all = TakeOvers::default();
-        let begun = |all: &mut TakeOvers, range: std::ops::Range<u64>| {
-            range.filter(|at| all.begin(peer, Duration::from_millis(*at)).is_ok()).count()
-        };
-        assert_eq!(begun(&mut all, 0..1000), 8, "of a daemon that has just started");
-        assert_eq!(begun(&mut all, 1000..11_000), 10);
-        let now = Duration::from_millis(10_500);
-        assert_eq!(all.begin(peer, now), Err(Duration::from_secs(11)));
-        all.begin(other, now).unwrap();
-        // What it did not use returns, and is forgotten.
-        assert_eq!(begun(&mut all, 20_000..20_500), 8);
-        all.begin(other, Duration::from_secs(60)).unwrap();
-        assert_eq!(all.budgets.len(), 1);
-    }
-
-    #[test]
-    fn peer_whose_paths_are_cut_each_second_never_waits() {
-        let mut all = TakeOvers::default();
-        for cut in 0..1000 {
-            // Messages of two cuts may come together.
-            let at = Duration::from_millis(cut / 2 * 2000);
-            all.begin(DaemonId([1; 16]), at).unwrap();
         }
     }
 }

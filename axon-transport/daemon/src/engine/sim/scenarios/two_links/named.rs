@@ -59,7 +59,7 @@ fn switches_at_random_instants_lose_nothing_of_the_liar_either() {
 }
 
 #[test]
-fn link_in_use_that_ends_at_each_switch_harms_nobody() {
+fn link_in_use_that_ends_at_each_switch_harms_no_other_peer() {
     for (mode, config) in sample(ONE_MODE) {
         let mut lying = Lying::new(2, mode, &config);
         for round in 0..20 {
@@ -130,7 +130,7 @@ fn seed(liar_elects: bool) -> u64 {
 }
 
 #[test]
-fn switch_flood_costs_few_take_overs_and_harms_nobody() {
+fn switch_flood_costs_few_take_overs_and_harms_no_other_peer() {
     for mode in sample("classic") {
         flood(seed(false), &mode, true);
         flood(seed(true), &mode, true);
@@ -138,7 +138,7 @@ fn switch_flood_costs_few_take_overs_and_harms_nobody() {
 }
 
 #[test]
-fn flood_of_successors_costs_few_take_overs_and_harms_nobody() {
+fn flood_of_successors_costs_few_take_overs_and_harms_no_other_peer() {
     for mode in sample("classic") {
         flood(seed(false), &mode, false);
         flood(seed(true), &mode, false);

@@ -138,16 +138,16 @@ fn harm_nobody(mode: &str) {
 }
 
 #[test]
-fn acts_by_chance_harm_nobody_in_classic() {
+fn acts_by_chance_harm_no_other_peer_in_classic() {
     harm_nobody("classic");
 }
 
 #[test]
-fn acts_by_chance_harm_nobody_in_session() {
+fn acts_by_chance_harm_no_other_peer_in_session() {
     harm_nobody("session");
 }
 
 #[test]
-fn acts_by_chance_harm_nobody_in_messages10() {
+fn acts_by_chance_harm_no_other_peer_in_messages10() {
     harm_nobody("messages10");
 }

@@ -246,7 +246,7 @@ fn copies_with_any_number_keep_the_order_and_come_once() {
 }
 
 #[test]
-fn copies_under_the_name_of_another_host_reach_nobody() {
+fn copies_under_the_name_of_another_host_reach_no_subscription() {
     let (mut liar, [first, second], subscription, route) = publisher(31);
     let honest = liar.honest[1].publisher.1;
     let before = liar.world.received(liar.honest[1]).len();
@@ -338,7 +338,7 @@ fn copies_that_are_cut_off_or_come_too_early_hold_bounded_memory() {
 }
 
 #[test]
-fn second_links_beyond_one_end_and_those_that_nobody_elects_do_not_stay() {
+fn second_links_beyond_one_end_and_those_without_an_election_do_not_stay() {
     let (mut liar, [first, second], ..) = publisher(34);
     let mut last = second;
     for election in 3..20 {
