@@ -197,10 +197,10 @@ impl Faults {
 
     fn kill_daemons(&mut self, place: &Place, hosts: [bool; 2], calm: bool) {
         let pids = [0, 1].map(|host| hosts[host].then(|| place.hosts[host].daemon()).flatten());
-        for pid in pids.into_iter().flatten() {
-            if crate::host::kill(pid) {
+        for (host, pid) in pids.into_iter().enumerate() {
+            if pid.is_some_and(crate::host::kill) {
                 self.count("daemons killed");
-                self.record.kills.push(DaemonKill { at: now_ns(), calm });
+                self.record.kills.push(DaemonKill { host, at: now_ns(), calm });
             }
         }
         if pids.iter().all(Option::is_some) {

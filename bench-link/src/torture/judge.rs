@@ -207,8 +207,8 @@ impl<'a> Judge<'a> {
         }
     }
 
-    /// Whether a matched subscriber of the other host was killed around the death of a daemon, long enough before `at` for
-    /// its samples to be given up.
+    /// Whether a matched subscriber of the other host was killed around the death of the daemon of the publisher's host,
+    /// long enough before `at` for its samples to be given up.
     fn has_ended_reader(&self, publisher: &Entry, at: u64) -> bool {
         let died = |subscriber: &Entry| match subscriber.fate {
             Fate::Killed { at } if subscriber.host != publisher.host => Some(at),
@@ -219,7 +219,7 @@ impl<'a> Judge<'a> {
         deaths.any(|death| {
             let (from, to) = (death.saturating_sub(ABSENCE), death + ABSENCE);
             let to = to.min(at.saturating_sub(ABSENCE));
-            death + GIVEN_UP > at && self.record.has_kill(from, to)
+            death + GIVEN_UP > at && self.record.has_kill_on(publisher.host, from, to)
         })
     }
 

@@ -5,6 +5,7 @@ use crate::path::Settings;
 pub(super) const SECOND: u64 = 1_000_000_000;
 
 pub(super) struct DaemonKill {
+    pub(super) host: usize,
     pub(super) at: u64,
     /// The path was left alone before and after, and no other daemon was killed later or earlier.
     pub(super) calm: bool,
@@ -22,6 +23,11 @@ impl Record {
     /// Whether a daemon was killed in this time.
     pub(super) fn has_kill(&self, from: u64, to: u64) -> bool {
         self.kills.iter().any(|kill| (from..=to).contains(&kill.at))
+    }
+
+    /// Whether the daemon of this host was killed in this time.
+    pub(super) fn has_kill_on(&self, host: usize, from: u64, to: u64) -> bool {
+        self.kills.iter().any(|kill| kill.host == host && (from..=to).contains(&kill.at))
     }
 
     /// Whether a daemon was killed in this time over a path that was not left alone.

@@ -126,7 +126,7 @@ fn play(seed: u64, mode: &str, lying: &mut Lying) {
 }
 
 /// Plays some seeds in a mode.
-fn harm_nobody(mode: &str) {
+fn play_seeds(mode: &str) {
     let seeds = if all_cases() { 200 } else { 1 };
     let (first, seeds) = (setting("SIMULATE_FIRST", 1), setting("SIMULATE_SEEDS", seeds));
     let config = modes().into_iter().find(|(name, _)| *name == mode).expect("a mode").1;
@@ -139,15 +139,15 @@ fn harm_nobody(mode: &str) {
 
 #[test]
 fn acts_by_chance_harm_no_other_peer_in_classic() {
-    harm_nobody("classic");
+    play_seeds("classic");
 }
 
 #[test]
 fn acts_by_chance_harm_no_other_peer_in_session() {
-    harm_nobody("session");
+    play_seeds("session");
 }
 
 #[test]
 fn acts_by_chance_harm_no_other_peer_in_messages10() {
-    harm_nobody("messages10");
+    play_seeds("messages10");
 }
