@@ -39,7 +39,12 @@ pub(crate) fn run(args: &cli::Echo) -> Result<(), CliError> {
     let subscription = session.create_subscription(spec).map_err(session::failure)?;
     let interrupt = interrupt::of(&session)?;
     let mut numbers = Numbers::default();
-    let outcome = print(args, &session, &subscription, &interrupt, &mut numbers);
+    let mut left = args.count;
+    let outcome = print(args, &mut left, (&session, &subscription, &interrupt), &mut numbers);
+    // What comes after the last requested message is not missed.
+    if left != Some(0) {
+        numbers.look_at_waiting(&subscription);
+    }
     let missed = numbers.missing.max(subscription.lost()) + numbers.unprinted;
     if missed > 0 {
         let messages = if missed == 1 { "message" } else { "messages" };
@@ -69,20 +74,30 @@ impl Numbers {
             self.missing += missing;
         }
     }
+
+    /// Takes messages that wait: the first of each publisher shows which ones before it were overwritten, while the
+    /// program was stopped or waited for the reader of its output. Those that wait do not count themselves.
+    fn look_at_waiting(&mut self, subscription: &Subscription) {
+        let mut payload = Vec::new();
+        // A publisher may be as fast as this loop.
+        for _ in 0..DEPTH {
+            let Some(info) = subscription.take(&mut payload) else { break };
+            self.came(&info);
+        }
+    }
 }
 
-/// Prints messages until the requested number has been printed, standard output is closed, or a signal comes.
+/// Prints messages until the requested number has been printed, standard output is closed, or a signal comes. `left` is
+/// the number that is still to be printed.
 fn print(
     args: &cli::Echo,
-    session: &Session,
-    subscription: &Subscription,
-    interrupt: &GuardCondition,
+    left: &mut Option<u64>,
+    (session, subscription, interrupt): (&Session, &Subscription, &GuardCondition),
     numbers: &mut Numbers,
 ) -> Result<(), CliError> {
     let mut payload = Vec::new();
-    let mut left = args.count;
     let mut out = io::stdout().lock();
-    while left != Some(0) {
+    while *left != Some(0) {
         session.wait(|| subscription.has_data() || interrupt.is_triggered(), None);
         if interrupt.is_triggered() {
             return match left {
@@ -92,7 +107,7 @@ fn print(
                 None => Ok(()),
             };
         }
-        while left != Some(0) && !interrupt.is_triggered() {
+        while *left != Some(0) && !interrupt.is_triggered() {
             let Some(info) = subscription.take(&mut payload) else { break };
             numbers.came(&info);
             let line = if args.json { as_json(&info, &payload) } else { as_text(&info, &payload) };
@@ -105,7 +120,7 @@ fn print(
                     return Err(error.into());
                 }
             }
-            left = left.map(|left| left - 1);
+            *left = left.map(|left| left - 1);
         }
     }
     Ok(())

@@ -216,6 +216,23 @@ fn echo_reports_missed_messages_when_ended_by_a_signal_or_hangup() {
     }
 }
 
+#[test]
+fn echo_that_waits_for_its_reader_reports_missed_messages_when_the_pipe_is_closed() {
+    let host = Host::new();
+    let mut echo = Running::start(host.axon(&["echo", "/tf"]));
+    let mut lines = echo.lines();
+    let _play = Running::start(host.axon(&["play", LOG, "--rate", "200", "--loop"]));
+    lines.next().expect("a line");
+    // The pipe is full after some hundred lines. The write waits, and the messages overwrite each other meanwhile.
+    let before = host.published();
+    eventually("more than may wait", || host.published() > before + 6_000);
+    drop(lines);
+    let output = echo.finish();
+    let said = Stderr::of(&output.stderr);
+    assert!(said.contains("axon echo: missed "), "{said}");
+    assert!(output.status.success(), "{said}");
+}
+
 /// Returns whether this process ignores SIGHUP: then the programs that it starts do as well.
 fn ignores_hangup() -> bool {
     let status = std::fs::read_to_string("/proc/self/status").expect("Linux has it");
